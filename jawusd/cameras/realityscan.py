@@ -63,7 +63,7 @@ def load_realityscan_xmp(folder: Path, sizes: Mapping[str, Size]) -> list[Camera
         node = next(parsed_xml(path).iter(f"{_RDF}Description"), None)
         values = {} if node is None else _xmp_values(node)
         if "Rotation" not in values or "Position" not in values:
-            raise CalibrationError("has no Rotation and Position.", path=path, hint="Export XMP with camera poses.")
+            raise CalibrationError("has no Rotation or no Position.", path=path, hint="Export XMP with camera poses.")
         size = known_size(path, path.stem, sizes)
         f35 = numbers(path, values.get("FocalLength35mm", ""), 1, "FocalLength35mm")[0]
         principal = [float(numbers(path, values.get(f"PrincipalPoint{a}", "0"), 1, "PrincipalPoint")[0]) for a in "UV"]

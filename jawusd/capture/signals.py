@@ -54,7 +54,7 @@ class Offset:
     """Time offset of a camera: its frame k is simultaneous with frame k + `frames` of the reference camera."""
 
     frames: int  # offset in whole frames
-    exact_frames: float  # offset with the estimated fraction of a frame
+    exact_frames: float  # offset including its estimated sub-frame part
     spread_frames: float  # maximum deviation of a matched light step from exact_frames; 0 for sound
     matched_steps: int  # number of light steps found in both cameras; 0 for sound
     confidence: float  # fraction of matched light steps, or `SoundMatch.confidence`; 0 to 1

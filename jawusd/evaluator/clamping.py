@@ -166,7 +166,7 @@ def _without_gaps(bound: SliceHull, spine: Spine, motion: Inside) -> Inside:
 
 
 def _leaves(bound: SliceHull, start: Array, end: Array) -> Mask:
-    """Return which straight lines from points (n, 3) inside the bound to other points (n, 3) leave it."""
+    """Return which line segments from points (n, 3) inside the bound to other points (n, 3) leave the bound."""
     length = np.linalg.norm(end - start, axis=1)
     margin = np.minimum(-distances(bound, start), -distances(bound, end))
     near = np.flatnonzero(margin < _STEEPEST * length)

@@ -127,7 +127,7 @@ class ContactField:
         return Clearance(value, gradient)
 
     def collides(self, d: Array, limit_mm: float) -> Mask:
-        """Return which d (n, 3) [mm] have less clearance than ``limit_mm``; False for NaN."""
+        """Return which jaw parameters d (n, 3) [mm] have less clearance than ``limit_mm``; False for NaN."""
         return self.clearance(d).clearance_mm < limit_mm - self.error_mm
 
     def collides_at(self, d: Array, limit_mm: float) -> bool:

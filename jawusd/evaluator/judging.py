@@ -65,7 +65,7 @@ class RigJudging(RigClearance, RigArrays):
         return _scalar_or_array(self.kernels.margins(rows).reshape(batch))
 
     def is_inside(self, d: ArrayLike, *, bound: BoundName = "slices") -> Mask:
-        """Return whether jaw parameters d (..., 3) [mm] lie inside the bound: a margin of 0 or more.
+        """Return whether jaw parameters d (..., 3) [mm] lie inside the bound, i.e. have a margin of 0 or more.
 
         The bound itself counts as inside, up to rounding of 1e-6 mm. The tolerance of measured poses does not apply.
         """
@@ -213,7 +213,9 @@ class VerdictStream:
         if T.shape != (4, 4):
             raise ValueError(f"T_skull_mandible must have shape (4, 4), got {T.shape}")
         if not self._time_s < time_s < np.inf:
-            raise ValueError(f"time_s must be finite and later than the last pose, {self._time_s}, got {time_s}")
+            raise ValueError(
+                f"time_s must be finite and later than that of the last pose ({self._time_s}), got {time_s}"
+            )
         verdict = self._judge(T)
         self._time_s = time_s
         if not verdict.measured():

@@ -102,7 +102,7 @@ def equations(model: Array, problem: Problem, x: Array, w: Scratch, A: Array, g:
         y2 = M[2, 0] * p0 + M[2, 1] * p1 + M[2, 2] * p2 + M[2, 3] * h
         r0, r1, r2 = y0 - problem.target[0, j], y1 - problem.target[1, j], y2 - problem.target[2, j]
         cost += r0 * r0 + r1 * r1 + r2 * r2
-        # a vector (b, h) moves by w x image + v h under the spatial velocity (w, v)
+        # under the spatial velocity (w, v), the image R b + t h of a homogeneous vector (b, h) moves by w x image + v h
         a0, b0, c0 = _velocity(S, 0, y0, y1, y2, h)
         a1, b1, c1 = _velocity(S, 1, y0, y1, y2, h)
         a2, b2, c2 = _velocity(S, 2, y0, y1, y2, h)

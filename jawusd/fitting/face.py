@@ -174,7 +174,7 @@ def _check_take(rig: JawRig, weights: Array, d: Array, times_s: Array) -> None:
     step = float(np.median(np.diff(times_s))) if len(times_s) > 1 else 0.0
     if len(d) * step < _LEAST_SECONDS:
         raise FittingError(
-            f"face and jaw overlap by {len(d) * step:.1f} s; at least {_LEAST_SECONDS:g} s are needed.",
+            f"the face and jaw recordings overlap by {len(d) * step:.1f} s; at least {_LEAST_SECONDS:g} s are needed.",
             hint="Check frame rates and offset: --fps, --jaw-fps, --offset.",
         )
     low, high = rig.d_range.T

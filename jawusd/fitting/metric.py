@@ -39,12 +39,12 @@ class MandibleMetric:
         return cls(landmark_vectors(points), extremes)
 
     def rms(self, M: Array, target: Array) -> Array:
-        """Return the root mean square displacement between motions (N, 4, 4) [mm], shape (N,)."""
+        """Return the RMS distance between points moved by M (N, 4, 4) and by target (N, 4, 4) [mm], shape (N,)."""
         difference = vector_images(*_parts(M), self.vectors) - vector_images(*_parts(target), self.vectors)
         return np.linalg.norm(difference, axis=(1, 2))
 
     def largest(self, M: Array, target: Array) -> Array:
-        """Return the largest displacement of any point between motions (N, 4, 4) [mm], shape (N,)."""
+        """Return the largest distance between any point moved by M (N, 4, 4) and by target [mm], shape (N,)."""
         return _farthest(M - target, self.extremes)
 
     def largest_at_least(self, M: Array, target: Array) -> Array:

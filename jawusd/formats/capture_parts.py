@@ -78,7 +78,10 @@ class Masks(Strict):
                 "arches. For example: upper_value = 1 and lower_value = 2"
             )
         if self.upper != self.lower and values != (None, None):
-            raise ValueError("upper_value and lower_value are only for labels, one file for both arches. Remove them")
+            raise ValueError(
+                "upper_value and lower_value apply only to label images, which hold both arches in one file. "
+                "Remove them"
+            )
         if self.upper_value is not None and self.upper_value == self.lower_value:
             raise ValueError(
                 f"upper_value and lower_value are both {self.upper_value}; they must differ. "

@@ -1,4 +1,4 @@
-"""Read PLY, as text or binary of both byte orders (G. Turk, "The PLY Polygon File Format", Stanford, 1994).
+"""Read PLY, text or binary in either byte order (G. Turk, "The PLY Polygon File Format", Stanford, 1994).
 
 The reader supports vertices with colours and texture coordinates, polygons with texture coordinates (`texcoord`,
 MeshLab), and triangle strips separated by -1. Other elements, and data after the last element, are ignored.
@@ -158,7 +158,7 @@ def _header(path: Path, data: bytes) -> tuple[list[_Element], int, str]:
             raise _bad_header(path, f'has the line "{line:.60}", which is not PLY') from error
     names = [element.name for element in elements]
     if order is None or len(set(names)) < len(names) or any(element.rows < 0 for element in elements):
-        raise _bad_header(path, 'has no "format", a duplicate element, or a negative count')
+        raise _bad_header(path, 'lacks "format", repeats an element, or has a negative count')
     return elements, found.end(), order
 
 

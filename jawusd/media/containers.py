@@ -24,7 +24,7 @@ FORMATS = (
 )  # fmt: skip
 
 
-#: FFmpeg's formats of single images.
+#: FFmpeg's single-image formats.
 PICTURES = (
     "image2", "png_pipe", "exr_pipe", "dpx_pipe", "tiff_pipe", "bmp_pipe", "jpeg_pipe", "j2k_pipe", "webp_pipe",
     "pam_pipe", "pgm_pipe", "ppm_pipe", "sgi_pipe", "cin_pipe", "hdr_pipe",
@@ -42,12 +42,12 @@ _NAMES = ("h264", "hevc", "prores", "dnxhd", "ffv1", "vp9", "av1", "mjpeg", "png
 def open_container(
     path: str | os.PathLike[str], formats: tuple[str, ...] = FORMATS, most_px: int = MOST_PX
 ) -> av.container.InputContainer:
-    """Open a video or sound file, or a file in one of the given formats.
+    """Open a video or audio file, or a file in one of the given formats.
 
     Decoders raise errors for damaged images or mark them as corrupt, and reject images of more than `most_px` pixels.
 
     Raises:
-        av.FFmpegError: the file has another format, or refers to other files.
+        av.FFmpegError: the file is in a format that is not allowed, or refers to other files.
         OSError: the file cannot be read.
     """
     limit = {"max_pixels": str(most_px)}

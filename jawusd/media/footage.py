@@ -17,7 +17,7 @@ from jawusd.media.clip import Clip, VideoFrame
 from jawusd.media.picture_sequence import PictureSequence
 from jawusd.media.video import Video
 
-_AHEAD = 24  # maximum number of images to decode forward; seeking is faster for more
+_AHEAD = 24  # maximum number of images to skip by decoding; beyond that, seeking is faster
 _BACK = 8  # number of images decoded together when images are read backwards
 _KEPT_BYTES = 128 << 20
 

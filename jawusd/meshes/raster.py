@@ -278,7 +278,7 @@ def count_and_not(first: Bits, second: Bits) -> np.int64:
         ValueError: the two images differ in shape.
     """
     if first.shape != second.shape:
-        raise ValueError("bit rows: the two images have different shapes")
+        raise ValueError("the two bit-packed images have different shapes")
     total = np.uint64(0)
     for y in range(first.shape[0]):
         for k in range(first.shape[1]):

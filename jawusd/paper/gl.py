@@ -228,7 +228,7 @@ class GlCounter:
 
     def _draw(self, target: _Target, matrices: moderngl.Buffer, layers: int) -> None:
         self._gl.enable_only(self._flags)
-        self._gl.front_face = "cw"  # rows are flipped, as image row 0 is row 0 of the target
+        self._gl.front_face = "cw"  # mirrored vertically: image row 0 is drawn to the bottom row
         target.frame.use()
         target.frame.clear()
         matrices.bind_to_storage_buffer(0)

@@ -209,7 +209,7 @@ def _with_leftovers(base: _Sum, points: Array, error: Callable[[_Sum], float]) -
 
 
 def _curves(found: _Sum, points: Array, root: Array, data: TrainingData) -> tuple[AdditiveModel, dict[str, object]]:
-    """Shift the rest pose of a sum to the closed bite and reparametrise its curves in mm; return model and notes."""
+    """Shift an additive model's rest pose to the closed bite and reparametrise its curves in mm; also return notes."""
     encoded = found.encode(points)
     rest = found.rest(encoded)
     reached = encoded - rest

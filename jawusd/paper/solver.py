@@ -36,7 +36,7 @@ class PaperConfig:
     # Half step of the finite differences; smaller steps are dominated by pixel quantisation, larger steps by curvature.
     difference_rad: float = radians(0.3)
     difference_mm: float = 0.15
-    # Length of the line search: about the motion between two video frames of an exercise.
+    # Longest step of the line search: about the motion between two video frames of an exercise.
     reach_rad: float = radians(1.0)
     reach_mm: float = 1.0
     # Interval length at which the golden-section search stops: a motion of a tenth of a pixel.

@@ -31,7 +31,7 @@ _REACH_MM = 3.0  # maximum penetration; deeper points lie beyond the base of a c
 # Priors: camera distance, standard deviation of its logarithm, and standard deviation of the distortion [-]. Phones are
 # held 80 to 200 mm from the teeth, macro lenses 200 to 400 mm.
 _DISTANCE_MM, _LOG_DISTANCE, _DISTORTION = 180.0, 0.5, 0.02
-_LOG_FOCAL = 0.05  # standard deviation of the log focal length between photographs of one camera (focusing)
+_LOG_FOCAL = 0.05  # standard deviation of the log focal length between photographs from one camera (due to focusing)
 _BITE_SIGMA = np.array([0.12] * 3 + [3.0] * 3)  # standard deviations of the bite prior [rad, mm]
 # Prior standard deviations of a step [rad, mm, log, -], which damp unknowns that the lines do not determine.
 _LARGEST_STEP = np.array([0.1] * 3 + [3.0, 3.0, 30.0] + [0.2, 0.02])

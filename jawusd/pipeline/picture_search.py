@@ -1,4 +1,4 @@
-"""Search for the teeth in video frames in which the arches are visibly apart."""
+"""Search for the teeth in video frames with a visible gap between the upper and lower arch."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ if TYPE_CHECKING:
 _PART, _EVERY, _FEWEST = 240, 8, 8
 # Number of starts tried per part of the take for each of the four camera orientations, the most likely one first.
 _TRIED = (4, 1, 1, 1)
-# Maximum number of starts tried, each of which takes about ten seconds of CPU time. If no start of six parts fits,
-# scans, cameras or detection are wrong, and more tries would not help. The limit is a number, not a duration, so that
-# results do not depend on the machine.
+# Maximum number of starts tried, each of which takes about ten seconds of CPU time. If no start from any of six parts
+# of the take fits, the scans, the cameras or the detection are wrong, and more tries would not help. The limit is a
+# number, not a duration, so that results do not depend on the machine.
 _MOST_TRIED = 42
 # Maximum fraction of the dividing line between the arches that may cross teeth for the arches to count as apart. In 64
 # images of eight mouths with smaller fractions, the arches were always separated correctly.
@@ -121,8 +121,8 @@ class PictureSearch(Generic[T]):
                 break
         raise TrackingError(
             _describe_failure(tried, best, frames[seen:]),
-            hint="Check that the scans or the rig belong to this subject. Otherwise, film both arches apart, "
-            "pick teeth in two cameras ([bootstrap]), or draw masks.",
+            hint="Check that the scans or the rig belong to this subject. Otherwise, film with the mouth open "
+            "so that both arches are visible, pick teeth in two cameras ([bootstrap]), or draw masks.",
         )
 
     def _candidates(self, part: range, turns: Mapping[str, int], progress: Progress) -> list[_Candidate]:
@@ -187,7 +187,7 @@ def arches_apart(pictures: Pictures, turns: Mapping[str, int]) -> dict[str, Rows
 def _describe_failure(tried: Sequence[int], best: Start[T] | None, left: range) -> str:
     """Return a message about a failed search: the frames tried, the best fit, and the frames not searched."""
     frames = sorted(set(tried))
-    found = f"the teeth were not found in {len(frames)} frames that show both arches apart"
+    found = f"the teeth were not found in {len(frames)} frames with a visible gap between the arches"
     if frames:
         found += f" ({', '.join(map(str, frames))})"
     if best is not None:

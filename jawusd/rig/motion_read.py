@@ -232,8 +232,8 @@ def frames_of_stage(stage: Usd.Stage, path: object) -> NDArray[np.int64]:
     first, last = int(np.ceil(stage.GetStartTimeCode())), int(np.floor(stage.GetEndTimeCode()))
     if not 0 < last - first + 1 <= MAX_FRAMES:
         raise FormatError(
-            f"its time codes run from {stage.GetStartTimeCode():g} to {stage.GetEndTimeCode():g}: no whole frame, or "
-            f"more than {MAX_FRAMES}.",
+            f"its time codes run from {stage.GetStartTimeCode():g} to {stage.GetEndTimeCode():g}: this contains no "
+            f"whole frame, or more than {MAX_FRAMES}.",
             path=str(path),
         )
     return np.arange(first, last + 1)

@@ -56,7 +56,7 @@ def add_margin(g: Graph, rig: JawRig, d: Value) -> Value:
 
 
 def add_twist(g: Graph, rig: JawRig, motion: RigidMotion[Value], name: str) -> None:
-    """Add the twists (omega [rad], v [mm]) of motions as an output, skull frame, shape (n, 6)."""
+    """Add the twists (omega [rad], v [mm]) of motions in the skull frame as an output, shape (n, 6)."""
     x = dot(motion.omega, motion.omega)
     a, b, _ = g.angle_coefficients(x)
     v = apply_series(motion.omega, motion.t, -0.5, g.inverse_coefficient(x, a, b))

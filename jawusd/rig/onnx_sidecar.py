@@ -276,7 +276,7 @@ def read_sidecar(path: str | os.PathLike[str], recorded: str | None = None) -> o
     try:
         model = onnx.load_from_string(content)
         onnx.checker.check_model(model)
-        convert_model_from_external_data(model)  # fails if weights are in other files, which a runtime would read
+        convert_model_from_external_data(model)  # fails for weights in external files, which a runtime would open
     except Exception as error:  # the exceptions of protobuf and onnx have no common base class
         raise FormatError(f"is not a valid ONNX file ({type(error).__name__}).", path=path) from error
     if model.functions or model.graph.sparse_initializer:  # the check above does not look for external data in these

@@ -157,7 +157,7 @@ def _swept(centres: Array, thin: Array, tall: Array) -> tuple[Array, NDArray[np.
     """Return vertices and faces of elliptic sections swept along a smooth path, closed by rounded ends."""
     at = np.linspace(0, len(centres) - 1, _SECTIONS * (len(centres) - 1) + 1)
     centres, thin, tall = (_smooth(rows, at) for rows in (centres, thin, tall))
-    # Rounded caps: further sections beyond both ends, shrinking like a circle.
+    # Rounded caps: further sections beyond both ends, with radii that follow a quarter circle.
     turn = np.linspace(0, np.pi / 2, 7)[1:-1]
     for end, inner in ((0, 1), (-1, -2)):
         ahead = centres[end] - centres[inner]

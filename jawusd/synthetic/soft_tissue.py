@@ -36,8 +36,8 @@ _PROFILE = np.array(
 # Rings of the mouth lining: depth, half width, and heights above and below the centre [mm].
 _LINING_RINGS = ((-78.0, 0.05, 0.05, 0.05), (-60.0, 36.0, 16.0, 16.0), (-24.0, 35.5, 18.0, 18.0))
 
-# Cross-section of a lip, from the wet side to the skin: distance outwards from the lip's edge, height over the plane of
-# the edge [mm], and redness.
+# Cross-section of a lip, from the wet side to the skin: distance outwards from the lip's edge, height above the plane
+# of the edge [mm], and redness.
 _LIP = np.array(
     [
         [4.5, -5.5, 1.0], [2.2, -4.2, 1.0], [0.7, -2.2, 1.0], [0.0, 0.0, 1.0], [0.5, 1.9, 1.0], [1.7, 3.4, 1.0],

@@ -162,7 +162,7 @@ def perform(person: Person, occlusion: Occlusion, frames: int, offsets: tuple[in
 def _controls(
     person: Person, frames: int, start: int, n: int, rng: np.random.Generator
 ) -> tuple[Array, NDArray[np.str_], Mask]:
-    """Return controls and exercise of every frame, and a weight that is 1 where the jaw is held in the closed bite."""
+    """Return the controls and the exercise of every frame, and a weight that is 1 where the jaw is held closed."""
     exercises = frames - OPEN_HOLD - REST_HOLD
     curves, names = schedule(_EXERCISES, exercises, rng, tempo=1.5)
     still = np.array([_HALF_OPEN, 0.0, 0.0])

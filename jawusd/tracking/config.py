@@ -126,8 +126,8 @@ class TrackingConfig:
     # closed lips, and 0.07 with scans without gum. Wrong poses can exceed this fraction, but are rejected because they
     # leave masks uncovered.
     first_share: float = 0.05
-    # Delay between cameras [frames] and mask bias [px] above which all frames are aligned again after correcting them:
-    # smaller values matter less than the noise of single frames.
+    # Delay between cameras [frames] and mask bias [px] above which they are corrected and all frames are aligned again;
+    # smaller values matter less than the noise of a single frame.
     refine_delay_frames: float = 0.03
     refine_bias_px: float = 0.1
     # Delay above which delays are corrected before camera poses are tested [frames]: larger than that between
@@ -140,7 +140,8 @@ class TrackingConfig:
     # Contour shift due to wrong camera poses above which camera poses are corrected [px]: smaller shifts are due to
     # annotator bias.
     refine_shift_px: float = 0.15
-    # Prior standard deviation of a camera's motion between calibration and take, per axis [rad, mm]: that of a knock.
+    # Prior standard deviation of a camera's motion between calibration and take, per axis [rad, mm]: about what an
+    # accidental knock causes.
     refine_turn_rad: float = 0.0035
     refine_move_mm: float = 0.5
     # Number of frames on which delays, mask bias and camera poses are iterated before all frames are aligned again;

@@ -181,7 +181,7 @@ HEAD = (
         ('labels = "l.mkv"', "needs upper_value and lower_value"),
         ('labels = "l.mkv", upper_value = 1, lower_value = 1', "are both 1"),
         ('labels = "l.mkv", upper = "u.mkv", upper_value = 1, lower_value = 2', "both labels and upper or lower"),
-        ('upper = "u.mkv", lower = "l.mkv", upper_value = 1', "are only for labels, one file for both arches"),
+        ('upper = "u.mkv", lower = "l.mkv", upper_value = 1', "apply only to label images, which hold both arches"),
         ('upper = "l.mkv", lower = "l.mkv"', "the same file, which needs upper_value and lower_value"),
         ('labels = "l.mkv", upper_value = 0, lower_value = 2', "must be 1 or more"),
     ],

@@ -69,7 +69,7 @@ def searched(monkeypatch):
 def test_a_long_take_without_teeth_ends_and_says_what_was_tried(searched):
     words, tried, footage = searched(lambda frame: None)
     assert len(tried) == 40 and max(footage.looked_at) < 10 + 10 * 240
-    assert "not found in 40 frames that show both arches apart (10, 18," in words
+    assert "not found in 40 frames with a visible gap between the arches (10, 18," in words
 
 
 def test_the_best_poor_fit_is_told(searched):

@@ -121,7 +121,7 @@ class StartSearch:
         return self._settled(finalists, views, footage, frame)
 
     def near(self, footage: Footage, frame: int, poses: Array) -> SearchResult:
-        """Return the best poses on a frame near given poses T_world_upper and T_world_lower, shape (2, 4, 4).
+        """Return the best poses in a video frame, searched near T_world_upper and T_world_lower, shape (2, 4, 4).
 
         Raises:
             TrackingError: no anatomically possible pair of poses.

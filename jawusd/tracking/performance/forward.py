@@ -1,4 +1,4 @@
-"""The first pass: alignment frame by frame from predictions, with recovery of lost teeth."""
+"""The first pass: alignment frame by frame from predictions, with re-acquisition of arches whose tracking was lost."""
 
 from __future__ import annotations
 

@@ -184,7 +184,7 @@ class Smoother:
         if not unknowns.fixed_head:
             own = self._wider * found.own + found.response @ shared @ np.swapaxes(found.response, 1, 2)
             return np.asarray(own, np.float64), found.shared
-        # The fixed head pose is one of the unknowns of the take.
+        # The head pose, which is constant over the take, is one of the take's unknowns.
         response = np.zeros((system.frames, LOCAL, unknowns.shared))
         response[:, HEAD, :6] = np.eye(6)
         response[:, JAW] = found.response

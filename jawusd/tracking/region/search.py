@@ -26,9 +26,9 @@ from jawusd.tracking.sequence.history import MotionPredictor
 _POINTS = 400  # number of scan points at which image colours are read to rank starts
 # Candidate rotations of the jaw about the condyles, up and down and to the side [degrees].
 _OPENED, _ASIDE = (-6.0, -4.5, -3.0, -1.5, 1.5, 3.0, 4.5, 6.0), (-4.0, -2.0, 2.0, 4.0)
-# Candidate positions of the incisal point [mm]: to the left, down, and in front of its path in plain opening. The
-# solver converges from a distance of about 1.7 mm. In a lateral excursion, the jaw rotates about the condyle of that
-# side, so the incisal point moves forward.
+# Candidate positions of the incisal point [mm]: to the left, down, and in front of its path in pure opening. The
+# solver converges from a distance of about 1.7 mm. In an excursion to one side, the jaw rotates about the condyle of
+# that side, so the incisal point moves forward.
 _DOWN = np.arange(0.0, 46.0, 2.5).tolist()
 _LEFT = (-12.0, -9.0, -6.0, -3.0, 3.0, 6.0, 9.0, 12.0)
 _PLACES_MM = [

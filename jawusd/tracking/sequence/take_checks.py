@@ -77,7 +77,7 @@ def lens_findings(names: Sequence[str], found: Magnification, limits: LensLimits
                 "scan_size",
                 "warning",
                 f"every camera shows the teeth {_than(common)} than the scans: the scale of the scans or of the "
-                f"calibration is wrong; at most {limits.common:.1%} is usual.",
+                f"calibration is wrong; a difference of at most {limits.common:.1%} is usual.",
                 value=round(100 * common, 2),
                 limit=100 * limits.common,
                 hint="Check the scans' unit and scaling, and the square size of the calibration board.",
