@@ -253,7 +253,7 @@ class _Reader:
                     raise self._cut_off(row)
                 (count,) = length.unpack_from(data, at)
                 if not count >= 0 or count % 1:
-                    raise _bad_header(self._path, f"does not fit its data: a list of {count:g} values")
+                    raise _bad_header(self._path, f"does not match the data: a list has {count:g} values")
                 counts.append(int(count))
                 at += length.size + int(count) * size
             if at > len(data):

@@ -1,4 +1,4 @@
-"""Alignment of head and jaw with the masks of one frame."""
+"""Alignment of head and jaw with the masks of one video frame."""
 
 from __future__ import annotations
 
