@@ -282,7 +282,7 @@ def _whole(cells: list[str] | None, default: int, key: str, path: Path) -> int:
         return default
     value = to_numbers([cells[:1]], lambda *_: key, path)[0, 0]
     if value % 1 != 0 or not 0 <= value <= _MOST_FRAMES:
-        raise FormatError(f"{key} is {cells[0]}; it must be a whole number.", path=path)
+        raise FormatError(f"{key} is {cells[0]}; expected a whole number from 0 to {_MOST_FRAMES}.", path=path)
     return int(value)
 
 
