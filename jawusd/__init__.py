@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from jawusd.base.errors import JawusdError
     from jawusd.evaluator import JawRig
     from jawusd.evaluator.skin import load_skin
+    from jawusd.fitting.align import align
     from jawusd.fitting.skin import fit_skin, save_skin
     from jawusd.pipeline.build import build
     from jawusd.pipeline.track import track
@@ -27,6 +28,7 @@ __all__ = [
     "JawRig",
     "JawusdError",
     "__version__",
+    "align",
     "build",
     "fit_skin",
     "load",
@@ -38,6 +40,7 @@ __all__ = [
 _MODULES = {
     "JawRig": "jawusd.evaluator",
     "JawusdError": "jawusd.base.errors",
+    "align": "jawusd.fitting.align",
     "build": "jawusd.pipeline.build",
     "fit_skin": "jawusd.fitting.skin",
     "load_skin": "jawusd.evaluator.skin",

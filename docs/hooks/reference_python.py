@@ -27,7 +27,7 @@ PAGES = {
     ),
     "fitting": (
         "Fitting the jaw model to poses, and tracking poses in pictures.",
-        ["jawusd.fitting", "jawusd.fitting.skin", "jawusd.tracking", "jawusd.photographs"],
+        ["jawusd.fitting", "jawusd.fitting.align", "jawusd.fitting.skin", "jawusd.tracking", "jawusd.photographs"],
     ),
     "geometry": ("Rotations, rigid motions, cameras and the anatomical frame.", ["jawusd.geometry"]),
     "plugins": (
@@ -50,6 +50,7 @@ TOP = """# jawusd
 | [`jawusd.JawRig`][jawusd.evaluator.JawRig] | the rig: pose, encode, margin, validate, ik |
 | [`jawusd.build`][jawusd.pipeline.build.build] | from a capture to a rig in one call |
 | [`jawusd.track`][jawusd.pipeline.track.track] | track both dental arches |
+| [`jawusd.align`][jawusd.fitting.align.align] | align a face model with a rig |
 | [`jawusd.fit_skin`][jawusd.fitting.skin.fit_skin] | learn the jaw from facial skin |
 | [`jawusd.save_skin`][jawusd.fitting.skin.save_skin] | store what was learned |
 | [`jawusd.load_skin`][jawusd.evaluator.skin.load_skin] | read what was learned |

@@ -54,6 +54,7 @@ GROUPS = {
         "rebake": "Make d and mandible of an edited stage agree.",
         "arkit-fit": "Fit the mapping from a subject's ARKit jaw weights to d.",
         "arkit-table": "Write the jaw joint's offset per ARKit shape.",
+        "align": "Align a face model with a rig by a few points.",
         "skin-fit": "Learn the jaw from facial skin, for closed lips.",
     },
     "Inspect": {
@@ -243,6 +244,7 @@ _NAMES = {
     "rebake_command": ("rebake",),
     "stage_commands": ("encode", "publish"),
     "animate_commands": ("animate", "arkit-fit", "arkit-table"),
+    "align_command": ("align",),
     "skin_command": ("skin-fit",),
     "solve_commands": ("solve", "live"),
     "library_commands": ("retarget", "library"),
