@@ -25,6 +25,7 @@ FILES = {
         "Keys: keys.json": "jawusd.formats.keys",
         "Faces: CSV of columns or points": "jawusd.formats.face_table",
         "Face models: correspondences, and alignment: JSON": "jawusd.formats.alignment",
+        "Face models: jaw motion in npz": "jawusd.formats.face_track",
         "ARKit face captures: CSV, and mappings: JSON": "jawusd.formats.arkit",
     },
     "What comes out": {

@@ -27,7 +27,14 @@ PAGES = {
     ),
     "fitting": (
         "Fitting the jaw model to poses, and tracking poses in pictures.",
-        ["jawusd.fitting", "jawusd.fitting.align", "jawusd.fitting.skin", "jawusd.tracking", "jawusd.photographs"],
+        [
+            "jawusd.fitting",
+            "jawusd.fitting.align",
+            "jawusd.fitting.face_judging",
+            "jawusd.fitting.skin",
+            "jawusd.tracking",
+            "jawusd.photographs",
+        ],
     ),
     "geometry": ("Rotations, rigid motions, cameras and the anatomical frame.", ["jawusd.geometry"]),
     "plugins": (

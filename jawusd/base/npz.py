@@ -48,6 +48,27 @@ def read_npz(path: str | os.PathLike[str], family: str, version: int) -> tuple[N
         UnitsError: other units or twist order.
     """
     path = Path(path)
+    arrays = read_arrays(path)
+    if "meta" not in arrays:
+        raise FormatError(f'has no "meta"; a {family} file stores its format and units there.', path=path)
+    try:
+        meta = json.loads(str(arrays.pop("meta")))
+    except (ValueError, RecursionError) as error:
+        raise FormatError(f'"meta" is not JSON ({error}).', path=path) from error
+    if not isinstance(meta, dict):
+        raise FormatError('"meta" must be a JSON object.', path=path)
+    check_format(meta.get("format"), family, version, path)
+    check_units(meta, path)
+    return arrays, meta
+
+
+def read_arrays(path: str | os.PathLike[str]) -> NamedArrays:
+    """Read the arrays of an npz file of any program; nothing is unpickled.
+
+    Raises:
+        FormatError: not an npz file, or a damaged one.
+    """
+    path = Path(path)
     check_input(path)
     arrays: NamedArrays = {}
     try:
@@ -64,17 +85,7 @@ def read_npz(path: str | os.PathLike[str], family: str, version: int) -> tuple[N
         raise FormatError("there is no such file.", path=path, hint="Check the path.") from error
     except (OSError, *DAMAGED) as error:
         raise FormatError(f"is not a readable npz file ({error!s:.200}).", path=path) from error
-    if "meta" not in arrays:
-        raise FormatError(f'has no "meta"; a {family} file stores its format and units there.', path=path)
-    try:
-        meta = json.loads(str(arrays.pop("meta")))
-    except (ValueError, RecursionError) as error:
-        raise FormatError(f'"meta" is not JSON ({error}).', path=path) from error
-    if not isinstance(meta, dict):
-        raise FormatError('"meta" must be a JSON object.', path=path)
-    check_format(meta.get("format"), family, version, path)
-    check_units(meta, path)
-    return arrays, meta
+    return arrays
 
 
 def check_format(found: object, family: str, version: int, path: str | os.PathLike[str]) -> int:

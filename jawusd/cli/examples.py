@@ -47,7 +47,7 @@ EXAMPLES = {
     "view": ("jawusd view out", "jawusd view capture --tracks out", "jawusd view out --page jaw.html"),
     "info": ("jawusd info out", "jawusd info out/tracks.npz --frame 120"),
     "report": ("jawusd report out", "jawusd report out --experiments"),
-    "validate": ("jawusd validate out", "jawusd validate out out/anim_take.usdc"),
+    "validate": ("jawusd validate out", "jawusd validate out --face jaw.npz --align T_skull_model.json"),
     "pose": ("jawusd pose out --d 20 2 1",),
     "encode": ("jawusd encode out poses.csv -o d.csv",),
     "ik": ("jawusd ik out --point 0,2,-3 --target 0,-18,-10",),

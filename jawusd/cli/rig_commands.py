@@ -2,13 +2,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from jawusd.cli.options import USD_SUFFIXES, Allow, Json, OptionalRigArg, Prim, RigArg, changed_in_folder, load_named
+from jawusd.cli.face_validation import (
+    AlignOption,
+    CsvOption,
+    FaceOption,
+    FaceOptions,
+    MappingOption,
+    StripOption,
+    validate_face,
+    verdict_lines,
+    verdict_rows,
+)
+from jawusd.cli.options import (
+    USD_SUFFIXES,
+    Allow,
+    Force,
+    Json,
+    OptionalRigArg,
+    Prim,
+    RigArg,
+    changed_in_folder,
+    load_named,
+)
 from jawusd.cli.output import emit
 
 if TYPE_CHECKING:
@@ -177,14 +197,30 @@ def validate(
             min=0.0, help="Allowed distance outside the bound; 0 for authored poses. Default: set by the rig."
         ),
     ] = None,
+    face: FaceOption = None,
+    align: AlignOption = None,
+    mapping: MappingOption = None,
+    csv: CsvOption = None,
+    strip: StripOption = None,
+    force: Force = False,
     prim: Prim = None,
     allow: Allow = None,
     as_json: Json = False,
 ) -> None:
-    """Check a rig, or poses against a rig; exit code 1 if something is invalid.
+    """Check a rig, or poses or a face track against a rig; exit code 1 if something is invalid.
 
-    A pose is inside the bound, within the tolerance of measured poses, or outside.
+    A pose is inside the bound, within the tolerance of measured poses, or outside. With --align, the thresholds are
+    widened by two standard deviations of the error that the alignment causes.
     """
+    if face is not None:
+        if poses is not None:
+            raise typer.BadParameter("give either poses or --face.", param_hint="--face")
+        validate_face(
+            rig, face, FaceOptions(align, mapping, csv, strip, force, residual_mm, tolerance_mm), prim, as_json
+        )
+        return
+    if align or mapping or csv or strip:
+        raise typer.BadParameter("is needed for --align, --mapping, --csv and --strip.", param_hint="--face")
     if poses is None:
         _validate_rig(rig, changed_in_folder(context), as_json)
         return
@@ -193,12 +229,7 @@ def validate(
     unbaked = _unbaked(loaded, poses, prim)
     frames, T = _poses_or_parameters(loaded, poses, prim)
     verdicts = loaded.validate(T, residual_limit_mm=residual_mm, tolerance_mm=tolerance_mm)
-    rows = [
-        {"frame": int(frame), "valid": bool(ok), "reason": words, "residual_mm": float(res), "margin_mm": float(margin)}
-        for frame, ok, words, res, margin in zip(
-            frames, verdicts.valid, verdicts.words(), verdicts.residual_mm, verdicts.margin_mm, strict=True
-        )
-    ]
+    rows = verdict_rows(frames, verdicts)
     invalid = [row for row in rows if not row["valid"]]
     inside = int((verdicts.valid & verdicts.inside()).sum())
     result = {
@@ -212,16 +243,9 @@ def validate(
     }
     counts = f"{inside} inside, {result['within_tolerance']} within tolerance, {len(invalid)} invalid"
     summary = f"{len(rows)} poses: {counts} (tolerance of measured poses {verdicts.tolerance_mm:.2f} mm)"
-    emit(result, as_json, lambda: [*_verdict_lines(rows), *unbaked.get("lines", []), summary])
+    emit(result, as_json, lambda: [*verdict_lines(rows), *unbaked.get("lines", []), summary])
     if invalid or unbaked:
         raise typer.Exit(NO)
-
-
-def _verdict_lines(rows: Sequence[Mapping[str, object]]) -> list[str]:
-    from jawusd.evaluator.verdicts import INSIDE
-
-    shown = "frame {frame}: {reason} (residual {residual_mm:.2f} mm, margin {margin_mm:.2f} mm)"
-    return [shown.format(**row) for row in rows if row["reason"] != INSIDE]
 
 
 def _unbaked(rig: JawRig, path: Path, prim: str | None) -> dict[str, list[str] | dict[str, float]]:

@@ -1,0 +1,101 @@
+"""Judge the jaw motion of a face model (FLAME, SMPL-X, any) that is aligned with a rig."""
+
+from __future__ import annotations
+
+import os
+from typing import NamedTuple
+
+import numpy as np
+
+from jawusd.base.arrays import Array
+from jawusd.base.errors import FormatError
+from jawusd.evaluator import JawRig
+from jawusd.evaluator.verdicts import Verdicts
+from jawusd.formats.alignment import Alignment, motion_of_points
+from jawusd.formats.atomic import write_text_atomic
+from jawusd.formats.face_track import read_jaw_track
+from jawusd.geometry import se3_inverse, transform_points
+
+# Standard deviations of the alignment's error by which thresholds are widened.
+_WIDENED = 2.0
+
+
+class JudgedFace(NamedTuple):
+    """The verdicts on a face track.
+
+    Attributes:
+        frames: frame numbers, shape (F,).
+        verdicts: one entry per frame.
+        alignment_mm: rms displacement of the landmarks that the expected error of the alignment causes [mm], (F,).
+        widened_mm: distance by which both thresholds were widened for it [mm].
+    """
+
+    frames: Array
+    verdicts: Verdicts
+    alignment_mm: Array
+    widened_mm: float
+
+
+def judge_jaw_track(
+    rig: JawRig,
+    path: str | os.PathLike[str],
+    alignment: Alignment,
+    residual_mm: float | None = None,
+    tolerance_mm: float | None = None,
+) -> JudgedFace:
+    """Judge the jaw motion of a face model.
+
+    The thresholds are widened by two standard deviations of the error that the alignment causes in the median frame;
+    wrong poses, where it is larger, do not widen them much.
+
+    Args:
+        path: see `jawusd.formats.face_track`.
+        residual_mm, tolerance_mm: thresholds to widen; default: those of the rig.
+
+    Raises:
+        FormatError: the file has no jaw motion, or the alignment belongs to another actor.
+    """
+    if alignment.actor != rig.actor:
+        raise FormatError(
+            f'the alignment is of "{alignment.actor}", but the rig is of "{rig.actor}".',
+            hint="Run `jawusd align` with this rig.",
+        )
+    track = read_jaw_track(path, alignment.joint)
+    T = track.poses(alignment, rig.T_rest)
+    error = alignment_error_mm(rig, T, alignment)
+    widened = _WIDENED * float(np.median(error)) if len(error) else 0.0
+    limits = rig.limits.replaced(residual_mm, tolerance_mm, None)
+    verdicts = rig.validate(
+        T, residual_limit_mm=limits.residual_mm + widened, tolerance_mm=limits.tolerance_mm + widened
+    )
+    return JudgedFace(track.frames, verdicts, error, widened)
+
+
+def alignment_error_mm(rig: JawRig, T_skull_mandible: Array, alignment: Alignment) -> Array:
+    """Return the rms displacement (F,) [mm] of the landmarks in poses (F, 4, 4) by the error of an alignment.
+
+    The motion D = T T_rest^-1 becomes A D A^-1, where A is the error. To first order, a landmark p is displaced by
+    J(D p) xi - R_D J(p) xi, with J of `motion_of_points` and xi the error. The closed bite is not displaced.
+    """
+    closed = transform_points(rig.T_rest, rig.landmarks)
+    D = T_skull_mandible @ se3_inverse(rig.T_rest)
+    moved = transform_points(T_skull_mandible, rig.landmarks)
+    J = motion_of_points(moved) - D[:, None, :3, :3] @ motion_of_points(closed)
+    squared: Array = np.einsum("flij,jk,flik->f", J, np.array(alignment.covariance), J) / len(closed)
+    return np.sqrt(squared)
+
+
+def save_verdicts(path: str | os.PathLike[str], judged: JudgedFace) -> None:
+    """Write the verdicts as CSV, atomically; the columns are named in the first row.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    lines = ["frame,valid,verdict,residual_mm,margin_mm,d1,d2,d3,alignment_mm"]
+    v = judged.verdicts
+    for frame, ok, words, *numbers in zip(
+        judged.frames, v.valid, v.words(), v.residual_mm, v.margin_mm, *v.d.T, judged.alignment_mm, strict=True
+    ):
+        shown = ",".join(f"{number:.4f}" for number in numbers)
+        lines.append(f'{frame:g},{int(ok)},"{words}",{shown}')
+    write_text_atomic(path, "\n".join([*lines, ""]))
