@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -49,6 +49,8 @@ class ShortConfig:
     frames: int = 14
     unpainted: float = 0.0  # probability of scans without vertex colours
     without_picks: float = 0.15  # probability of captures without picks, in which the teeth must be searched
+    cameras: int | None = None  # drawn unless given
+    size_px: tuple[int, int] | None = None  # of the pictures, drawn unless given
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,7 +91,7 @@ def draw_capture(config: ShortConfig) -> ShortCapture:
     traits = draw_traits(config.seed)
     bite = build_bite(traits)
     scanner = draw_scanner(config.seed, config.unpainted)
-    cameras, T_world_bite = draw_cameras(rng)
+    cameras, T_world_bite = draw_cameras(rng, config.cameras, config.size_px)
     joint = draw_joint(np.random.default_rng([config.seed, 0x7A77]))
     motion = draw_motion(joint, bite, T_world_bite, config.frames, rng)
     turn = so3_exp(rng.normal(size=3) * 1.5)
@@ -115,15 +117,39 @@ def draw_capture(config: ShortConfig) -> ShortCapture:
     )
 
 
+def draw_shot(capture: ShortCapture, draw: int, frames: int) -> ShortCapture:
+    """Draw another take of the person and the scans of a capture, with other cameras, motion and annotator."""
+    own = int(np.random.SeedSequence([capture.config.seed, 0x5407, draw]).generate_state(1)[0])
+    config = replace(capture.config, seed=own, frames=frames, without_picks=1.0)
+    rng = np.random.default_rng([own, 0x5C09])
+    cameras, T_world_bite = draw_cameras(rng, config.cameras, config.size_px)
+    count = len(cameras)
+    return replace(
+        capture,
+        config=config,
+        annotator=draw_annotator(own, count),
+        cameras=cameras,
+        offsets=[0] * count,
+        delays=np.zeros(count),
+        motion=draw_motion(capture.motion.joint, capture.bite, T_world_bite, frames, rng),
+    )
+
+
 def write_short_capture(folder: str | os.PathLike[str], config: ShortConfig) -> ShortCapture:
-    """Write a capture folder with scans, masks, calibration, picks, capture.toml and truth; return the random choices.
+    """Draw and write a capture; see `write_capture`."""
+    capture = draw_capture(config)
+    write_capture(folder, capture)
+    return capture
+
+
+def write_capture(folder: str | os.PathLike[str], capture: ShortCapture) -> None:
+    """Write a capture folder with scans, masks, calibration, picks, capture.toml and truth.
 
     Raises:
         OutputError: the folder cannot be written.
         OSError: a mask cannot be written.
     """
     folder = Path(folder)
-    capture = draw_capture(config)
     suffix = capture.scanner.suffix
     for jaw, mesh in zip(JAWS, capture.scans, strict=True):
         write_bytes_atomic(folder / "scans" / f"{jaw}_teeth{suffix}", encoded(mesh, capture.scanner))
@@ -131,7 +157,6 @@ def write_short_capture(folder: str | os.PathLike[str], config: ShortConfig) -> 
     _write_masks(folder, capture)
     write_npz_atomic(folder / "truth" / "truth.npz", _truth(capture))
     write_text_atomic(folder / "capture.toml", _description(capture))
-    return capture
 
 
 def labelled(capture: ShortCapture, camera: int, t: float, finer: int = 1) -> Drawn:

@@ -127,10 +127,15 @@ class Motion:
         return np.asarray(self.T_world_head @ make_transform(turn, _PIVOT_MM + shift - turn @ _PIVOT_MM))
 
 
-def draw_cameras(rng: np.random.Generator) -> tuple[list[Camera], Array]:
-    """Return two to four cameras and the head pose T_world_bite (4, 4); the world is the first camera's frame."""
-    count = int(rng.choice([2, 3, 4], p=[0.1, 0.75, 0.15]))
-    size = SIZES_PX[int(rng.choice(4, p=[0.2, 0.35, 0.3, 0.15]))]
+def draw_cameras(
+    rng: np.random.Generator, count: int | None = None, size: tuple[int, int] | None = None
+) -> tuple[list[Camera], Array]:
+    """Return two to four cameras and the head pose T_world_bite (4, 4); the world is the first camera's frame.
+
+    Number of cameras and size of the pictures [px] are drawn unless given.
+    """
+    drawn_count, drawn_size = rng.choice([2, 3, 4], p=[0.1, 0.75, 0.15]), rng.choice(4, p=[0.2, 0.35, 0.3, 0.15])
+    count, size = count or int(drawn_count), size or SIZES_PX[int(drawn_size)]
     apart = rng.uniform(26.0, 48.0)
     around = {2: (-0.45, 0.45), 3: (0.0, 1.0, -1.0), 4: (0.0, 1.0, -1.0, 0.3)}[count]
     above = {2: (0.0, 0.0), 3: (0.0, 0.1, -0.1), 4: (-0.15, 0.0, 0.0, 0.6)}[count]
