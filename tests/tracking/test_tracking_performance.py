@@ -1,5 +1,6 @@
 """Performances of a known jaw: unknowns, a take with lips closed in some frames, one and several cameras."""
 
+import shutil
 from dataclasses import replace
 
 import cv2
@@ -129,6 +130,20 @@ def test_a_performance_is_found_and_carried_through_closed_lips(jaw, scans, trut
         transform_points(found.T_world_upper, crown) - transform_points(truth[1], crown), axis=-1
     ).mean(1)
     assert head[seen()].max() < 2.5 * seen_mm
+
+
+def test_a_wrong_mask_in_one_of_three_cameras_costs_no_frame(jaw, scans, truth, folder, tmp_path):
+    """A mask with a large patch beside the teeth is left out; the other masks of the frame are used."""
+    spoilt, k = shutil.copytree(folder, tmp_path / "spoilt"), 8
+    path = small_take.png(spoilt, "cam1", "lower", k)
+    mask = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    rows, columns = np.nonzero(mask)
+    cv2.circle(mask, (int(columns.max()), int(rows.max())), int(np.ptp(columns)) // 3, 255, -1)
+    cv2.imwrite(str(path), mask)
+    found = solved(jaw, scans, truth, spoilt, small_take.CAMERAS)
+    assert found.state[k] == SolveState.SOLVED and tip_error_mm(jaw, found, truth)[k] < 0.1
+    unused = np.argwhere(~found.use[seen()])
+    np.testing.assert_array_equal(unused, [[np.flatnonzero(seen() == k)[0], 1, 1]])
 
 
 @pytest.mark.parametrize("cameras", [1, 3])

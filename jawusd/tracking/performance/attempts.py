@@ -24,6 +24,7 @@ LARGEST_SIGMA = np.r_[[0.3] * 3, [30.0] * 3, [10.0] * 3]
 # Matched contour below which an arch is rejected [px]: 2 mm of tooth edge. Tracking without a rig requires a longer
 # contour.
 _LEAST_MATCHED_PX = 15.0
+_FEWEST_MASKS = 2  # minimum number of masks that an arch must fit if another mask is left out
 _TYPICAL_PX = 0.4  # typical residual of hand-drawn masks at the working resolution [px]
 
 
@@ -116,7 +117,8 @@ class Attempts:
         if not instant.present.any():
             return empty_fit(start, instant)
         expected = Expected(start, sigma**-2.0)
-        return self.judged(self.attempt(start, expected, instant, instant.present, self.config.wide_gates_px), instant)
+        trial = self.attempt(start, expected, instant, instant.present, self.config.wide_gates_px)
+        return self.judged(self.without_wrong_masks(trial, expected, instant), instant)
 
     def attempt(self, start: Pose, expected: Expected, instant: Instant, use: Mask, gates: Sequence[float]) -> Trial:
         """Align from a start pose with a subset of the masks, shape (2, C)."""
@@ -137,6 +139,21 @@ class Attempts:
         uncovered = np.where(trial.use, trial.uncovered, 0.0).max(1) > c.lost_coverage
         few = matched_px(trial.solution) < _LEAST_MATCHED_PX
         return np.asarray(trial.use.any(1) & (rough | uncovered | few))
+
+    def without_wrong_masks(self, trial: Trial, expected: Expected, instant: Instant) -> Trial:
+        """Leave out a single mask of each arch that does not fit, if the arch then fits at least two other masks."""
+        for r in ARCHES:
+            if not self.bad(trial)[r] or trial.use[r].sum() <= _FEWEST_MASKS:
+                continue  # if fewer masks would remain, a wrong pose is more likely than a wrong mask
+            masks = np.flatnonzero(trial.use[r])  # the mask that the scan covers least is tried first
+            for c in masks[np.argsort(-trial.uncovered_px[r, masks])]:
+                use = trial.use.copy()
+                use[r, c] = False
+                other = self.attempt(expected.pose, expected, instant, use, self.config.wide_gates_px)
+                if not self.bad(other)[r]:
+                    trial = other
+                    break
+        return trial
 
     def judged(self, trial: Trial, instant: Instant) -> FrameFit:
         """Return the attempt as a frame fit, excluding arches that do not fit their masks."""

@@ -48,6 +48,9 @@ class ForwardPass:
         trial = attempts.attempt(expected.pose, expected, instant, instant.present, gates)
         if not attempts.bad(trial).any():
             return attempts.judged(trial, instant)
+        trial = attempts.without_wrong_masks(trial, expected, instant)
+        if not attempts.bad(trial).any():
+            return attempts.judged(trial, instant)
         for start in self._other_starts(expected, instant):
             around = replace(expected, pose=start)
             other = attempts.attempt(start, around, instant, instant.present, config.wide_gates_px)
