@@ -12,12 +12,13 @@ from jawusd.formats.mesh import Mesh, crown_face_mask
 from jawusd.formats.tracks import LOST, RECOVERED, TRACKED, load_tracks, save_tracks
 from jawusd.geometry import Camera, rigidity_defect, se3_exp, se3_inverse, se3_log
 from jawusd.tracking import TrackingConfig, track_capture
+from jawusd.tracking.contour.annotator import DRAWN
 from jawusd.tracking.contour.equations import OutlineSums, Solution
 from jawusd.tracking.contour.frame_record import FrameRecord
 from jawusd.tracking.sequence.delays import bridge, delay_motions, interpolation_errors
 from jawusd.tracking.sequence.extrinsics import Extrinsics, corrected_cameras
 from jawusd.tracking.sequence.frame_tracker import FrameTracker
-from jawusd.tracking.sequence.nuisance import DRAWN, Nuisances, corrected_pose
+from jawusd.tracking.sequence.nuisance import Nuisances, corrected_pose
 
 FRAMES = 16
 WITHOUT = TrackingConfig(refine_rounds=0)
@@ -79,7 +80,7 @@ def test_scans_without_gum_have_larger_uncertainties(tmp_path, monkeypatch):
         return np.array(list(found.meta["outline_bias_sigma_px"].values()))
 
     unknown = sigma_px()
-    monkeypatch.setattr("jawusd.tracking.sequence.take.DRAWN_BESIDE_CROWNS", DRAWN)
+    monkeypatch.setattr("jawusd.tracking.contour.annotator.DRAWN_BESIDE_CROWNS", DRAWN)
     assert (unknown > 1.05 * sigma_px()).all()
 
 

@@ -15,6 +15,7 @@ from jawusd.evaluator import JawRig
 from jawusd.formats.performance import SolveState
 from jawusd.geometry import relative_pose, transform_point, transform_points
 from jawusd.tracking.config import TrackingConfig
+from jawusd.tracking.contour.annotator import DRAWN
 from jawusd.tracking.contour.equations import twist_between
 from jawusd.tracking.contour.scan import prepare_scan, teeth_centre
 from jawusd.tracking.contour.solver import ContourSolver
@@ -56,7 +57,8 @@ def folder(jaw, truth, tmp_path_factory):
     return write_masks(tmp_path_factory.mktemp("shot"), jaw, truth, small_take.CAMERAS)
 
 
-def write_masks(out, jaw, truth, cameras):
+def write_masks(out, jaw, truth, cameras, grown_px=(0.0, 0.0)):
+    """Write the masks of the take, whose outlines lie `grown_px` outside of the upper and lower teeth."""
     rng = np.random.default_rng(0)
     for camera in cameras:
         for row in small_take.ROWS:
@@ -64,8 +66,10 @@ def write_masks(out, jaw, truth, cameras):
         for k, (d, head) in enumerate(zip(*truth)):
             if k in HIDDEN:
                 continue
-            masks = render_masks(small_take.MESHES, np.stack([head, head @ jaw.pose(d)]), camera, None, 0.3, rng)
-            for row, mask in zip(small_take.ROWS, masks):
+            shown = small_take.MESHES, np.stack([head, head @ jaw.pose(d)]), camera, None, 0.3, rng
+            masks = {grown: render_masks(*shown, grown_px=grown) for grown in sorted(set(grown_px))}
+            for r, row in enumerate(small_take.ROWS):
+                mask = masks[grown_px[r]][r]
                 cv2.imwrite(str(small_take.png(out, camera.name, row, k)), (mask > 127).astype(np.uint8) * 255)
     return out
 
@@ -130,6 +134,21 @@ def test_a_performance_is_found_and_carried_through_closed_lips(jaw, scans, trut
         transform_points(found.T_world_upper, crown) - transform_points(truth[1], crown), axis=-1
     ).mean(1)
     assert head[seen()].max() < 2.5 * seen_mm
+
+
+def test_sigma_covers_what_a_biased_annotator_does_to_depth(jaw, scans, truth, tmp_path, monkeypatch):
+    """One camera; outlines outside of the upper teeth and inside of the lower ones."""
+    folder = write_masks(tmp_path, jaw, truth, small_take.CAMERAS[:1], (0.8, -0.3))
+
+    def z2():
+        found = solved(jaw, scans, truth, folder, small_take.CAMERAS[:1])
+        away = (found.d - truth[0])[seen()]
+        return np.einsum("fi,fij,fj->f", away, np.linalg.inv(found.covariance[seen(), 6:, 6:]), away).mean() / 3
+
+    assert z2() < 2
+    none = replace(DRAWN, common=(0.01, 0.01, 0.01), arch=(0.01, 0.01, 0.01), camera=(0.01, 0.01))
+    monkeypatch.setattr("jawusd.tracking.contour.annotator.DRAWN", none)
+    assert z2() > 4
 
 
 def test_a_wrong_mask_in_one_of_three_cameras_costs_no_frame(jaw, scans, truth, folder, tmp_path):

@@ -9,6 +9,7 @@ import numpy as np
 
 from jawusd.base.arrays import Array
 from jawusd.tracking.config import TrackingConfig
+from jawusd.tracking.contour.annotator import AnnotatorPrior, drawn_prior
 from jawusd.tracking.contour.quality import correlation_px, residual_px
 from jawusd.tracking.contour.scan import ARCHES
 from jawusd.tracking.contour.solver import Matched
@@ -17,7 +18,7 @@ from jawusd.tracking.performance.coordinates import HEAD, JAW, LOCAL, Coordinate
 from jawusd.tracking.performance.instant import InstantSolver
 from jawusd.tracking.performance.motion import Motion, head_bends, measured_motion
 from jawusd.tracking.performance.system import TakeSystem
-from jawusd.tracking.performance.unknowns import DRAWN, HabitPrior, TakeState, Unknowns
+from jawusd.tracking.performance.unknowns import TakeState, Unknowns
 from jawusd.tracking.performance.views import Views, growth_of
 
 # Number of rounds in which outlines are matched again; a third round would change less than 0.01 mm.
@@ -55,7 +56,7 @@ class Smoother:
         fixed_head: bool = False,
         free_focal: bool = False,
         length_px: float | None = None,
-        habits: HabitPrior = DRAWN,
+        annotator: AnnotatorPrior | None = None,
         wider: float = WIDER,
     ) -> None:
         """Configure the refinement.
@@ -70,7 +71,7 @@ class Smoother:
             fixed_head: whether the head pose is constant.
             free_focal: whether to estimate the focal lengths.
             length_px: correlation length of outline errors; default: estimated from the residuals.
-            habits: prior on annotator bias, the offsets between mask outlines and tooth edges.
+            annotator: prior on annotator bias; default: of hand-drawn masks.
             wider: ratio of the true to the computed variance of a frame's unknowns.
         """
         self._wider = wider
@@ -79,9 +80,13 @@ class Smoother:
             self._rounds = 0
         self._instants, self._views, self._frames, self._fps = instants, views, frames, fps
         self._coordinates: Coordinates = instants.coordinates
-        free = cameras if free_focal else 0
         self._unknowns = Unknowns(
-            instants.coordinates, len(frames), fixed_head=fixed_head, free_focal=free, habits=habits
+            instants.coordinates,
+            len(frames),
+            cameras,
+            fixed_head=fixed_head,
+            free_focal=free_focal,
+            annotator=annotator or drawn_prior(instants.solver.scans),
         )
 
     def run(self, fits: Sequence[FrameFit], done: Callable[[int, int], None] = lambda done, total: None) -> Smoothed:
@@ -92,7 +97,7 @@ class Smoother:
             done: called with the number of frames matched and the total number of frames.
         """
         config, fits = self._instants.config, list(fits)
-        state = TakeState.unknown(self._cameras)
+        state = self._unknowns.start()
         weight = 1.0 / outline_variance(fits, config, self._length_px)
         good = np.array([fit.found.all() for fit in fits])
         motion = measured_motion(self._coordinates, [fit.pose for fit in fits], good, self._fps)

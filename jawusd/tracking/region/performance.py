@@ -15,6 +15,7 @@ from jawusd.evaluator import JawRig
 from jawusd.formats.performance import Performance
 from jawusd.geometry import Camera
 from jawusd.tracking.config import TrackingConfig
+from jawusd.tracking.contour.annotator import AnnotatorPrior
 from jawusd.tracking.contour.quality import score_px
 from jawusd.tracking.contour.scan import Scan, teeth_centre, thinned
 from jawusd.tracking.contour.solver import ContourSolver
@@ -24,7 +25,6 @@ from jawusd.tracking.performance.instant import InstantSolver
 from jawusd.tracking.performance.motion import KNOWN, STEADY
 from jawusd.tracking.performance.results import performance_of
 from jawusd.tracking.performance.smoother import WIDER, Smoothed, Smoother, with_one_head
-from jawusd.tracking.performance.unknowns import HabitPrior
 from jawusd.tracking.region.appearance import Cut, LearnedColours
 from jawusd.tracking.region.recovery import both_ways, contradicts, nearest_found, recover, replace_poses
 from jawusd.tracking.region.rig_tracker import RigTracker
@@ -47,7 +47,8 @@ _FIRST_FRAMES, _FOCAL_ROUNDS = 120, 3
 # Prior on the offsets between colour borders and tooth edges in a take; and correlation length of the residuals along
 # an outline [px]. Teeth darken towards their free edges, where borders lie up to half a pixel inside; gum-line offsets
 # are learned while tracking.
-_BORDERS, _CORRELATION_PX = HabitPrior((0.4, 0.08, 0.02), 5.0), 80.0
+_BORDERS = AnnotatorPrior(common=(0.0, 0.0, 0.0), arch=(0.4, 0.08, 0.02), camera=(0.0, 0.0), frames=5.0)
+_CORRELATION_PX = 80.0
 _ALONE = 2.0  # factor on the variance for a single camera [-], since no other view reveals shifted borders
 _CLEARLY = 1.05  # minimum ratio of matched contour for another pose to replace a trusted one
 # maximum difference of jaw parameters of equal poses [mm]
@@ -232,7 +233,7 @@ class PictureTake:
             fixed_head=shot.fixed_head,
             free_focal=shot.free_focal,
             length_px=_CORRELATION_PX,
-            habits=_BORDERS,
+            annotator=_BORDERS,
             wider=WIDER * (_ALONE if len(shot.cameras) == 1 else 1.0),
         )
         return smoother.run(fits)

@@ -14,6 +14,7 @@ from jawusd.formats.notes import TracksMeta
 from jawusd.formats.tracks import LOST, TRACKED, LostReason, Tracks
 from jawusd.geometry import Camera
 from jawusd.tracking.config import TrackingConfig
+from jawusd.tracking.contour.annotator import AnnotatorPrior
 from jawusd.tracking.contour.equations import Solution
 from jawusd.tracking.contour.frame_record import NO_LOSS, FrameRecord, Loss
 from jawusd.tracking.contour.quality import matched_px, score_px
@@ -25,7 +26,7 @@ from jawusd.tracking.region.condyle_fusion import CondyleFusion
 from jawusd.tracking.region.tracker import RegionPose
 from jawusd.tracking.sequence.closed_bite import RestFrames, observe_bite, rest_frames
 from jawusd.tracking.sequence.extrinsics import Extrinsics
-from jawusd.tracking.sequence.nuisance import AnnotatorPrior, TakeEquations, corrected_pose
+from jawusd.tracking.sequence.nuisance import TakeEquations, corrected_pose
 from jawusd.tracking.sequence.results import assemble, outline_variance
 from jawusd.tracking.sequence.take_checks import OF_COLOURS, lens_findings, mirror_findings
 from jawusd.tracking.sequence.time_checks import time_findings
@@ -38,7 +39,7 @@ _MOST = 0.6  # minimum length of a run of good frames, as a fraction of the take
 
 #: Prior on the offsets between colour borders and tooth edges. Borders lie up to half a pixel inside the edges, since
 #: teeth darken towards them; gum-line offsets are learned while tracking.
-BORDERS = AnnotatorPrior(edge_px=0.3, gum_px=0.08, gum_mm=0.02, arch_px=0.25, arch_mm=0.01, camera_px=0.08, frames=5.0)
+BORDERS = AnnotatorPrior(common=(0.3, 0.08, 0.02), arch=(0.25, 0.25, 0.01), camera=(0.08, 0.08), frames=5.0)
 FOR_COLOURS = TrackingConfig(known_correlation_px=CORRELATION_PX)
 
 

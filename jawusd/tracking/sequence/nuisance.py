@@ -9,6 +9,7 @@ import numpy as np
 
 from jawusd.base.arrays import Array
 from jawusd.tracking.config import TrackingConfig
+from jawusd.tracking.contour.annotator import DRAWN, AnnotatorPrior, bias_layers
 from jawusd.tracking.contour.equations import Solution, motion_about
 from jawusd.tracking.contour.frame_record import FrameRecord
 from jawusd.tracking.contour.scan import ARCHES
@@ -76,35 +77,6 @@ class Nuisances:
 _PRIOR_DELAY_FRAMES = 0.5
 
 
-@dataclass(frozen=True)
-class AnnotatorPrior:
-    """Prior standard deviations of mask biases.
-
-    Attributes:
-        edge_px, gum_px, gum_mm: common bias of free edges and gum line, bias of the gum line relative to free edges,
-            and bias of the gum line along the crown surface.
-        arch_px, arch_mm, camera_px: differences of the bias between arches and between cameras.
-        frames: effective number of independent frames in a take [-]: few, since all frames show the same lips and
-            teeth.
-    """
-
-    edge_px: float
-    gum_px: float
-    gum_mm: float
-    arch_px: float
-    arch_mm: float
-    camera_px: float
-    frames: float
-
-
-#: Prior for hand-drawn masks.
-DRAWN = AnnotatorPrior(edge_px=0.5, gum_px=0.4, gum_mm=0.1, arch_px=0.15, arch_mm=0.05, camera_px=0.1, frames=1.5)
-
-#: Prior for hand-drawn masks and scans without gum. For these scans, outlines at the neck of a tooth are classified by
-#: their direction, and classification errors recur in every frame.
-DRAWN_BESIDE_CROWNS = replace(DRAWN, frames=0.75)
-
-
 class _Layout:
     """Indices of the unknowns of a take: delays, annotator biases, and camera twists."""
 
@@ -113,13 +85,7 @@ class _Layout:
         self.twists = cameras + 9 + 4 * cameras
         self.size = self.twists + 6 * cameras
         self._habits = np.zeros((2, cameras, 3, self.size))
-        for arch, camera in np.ndindex(2, cameras):
-            of_arch = cameras + 3 + 3 * arch
-            of_view = cameras + 9 + 2 * (2 * camera + arch)
-            out = self._habits[arch, camera]
-            out[0, [cameras, of_arch, of_view]] = 1.0
-            out[1, [cameras, cameras + 1, of_arch + 1, of_view + 1]] = 1.0
-            out[2, [cameras + 2, of_arch + 2]] = 1.0
+        self._habits[..., cameras : self.twists] = bias_layers(cameras)
 
     def twist(self, camera: int) -> slice[int, int, None]:
         """Return the slice of a camera's twist in the unknowns."""
@@ -131,15 +97,12 @@ class _Layout:
 
     def prior_sigma(self) -> Array:
         """Return the prior standard deviations of delays and annotator biases, shape (twists,)."""
-        of = self._annotator
-        arch = [of.arch_px, of.arch_px, of.arch_mm]
-        habits = [of.edge_px, of.gum_px, of.gum_mm, *arch, *arch]
-        return np.r_[np.full(self.cameras, _PRIOR_DELAY_FRAMES), habits, np.full(4 * self.cameras, of.camera_px)]
+        return np.r_[np.full(self.cameras, _PRIOR_DELAY_FRAMES), self._annotator.sigma(self.cameras)]
 
     def redundancy(self, frames: int) -> Array:
         """Return the factor by which a number of frames overstates the information on each of the unknowns (size,)."""
         out = np.ones(self.size)
-        out[self.cameras : self.twists] = max(1.0, frames / self._annotator.frames)
+        out[self.cameras : self.twists] = self._annotator.redundancy(frames)
         return out
 
 

@@ -16,6 +16,7 @@ from jawusd.formats.notes import TracksMeta
 from jawusd.formats.tracks import LOST, RECOVERED, TRACKED, Tracks
 from jawusd.geometry import Camera
 from jawusd.tracking.config import FOR_TAKES, TrackingConfig
+from jawusd.tracking.contour.annotator import drawn_prior
 from jawusd.tracking.contour.frame_record import FrameRecord, PackedRecords, whole_frames
 from jawusd.tracking.contour.scan import prepare_scan, teeth_centre
 from jawusd.tracking.contour.solver import ContourSolver
@@ -25,7 +26,7 @@ from jawusd.tracking.initialization.start import find_start, quote_findings
 from jawusd.tracking.sequence.closed_bite import RestFrames, observe_bite, rest_frames
 from jawusd.tracking.sequence.delays import BRIDGE_FRAMES, bridge, delay_motions
 from jawusd.tracking.sequence.extrinsics import Extrinsics
-from jawusd.tracking.sequence.nuisance import DRAWN, DRAWN_BESIDE_CROWNS, AnnotatorPrior, Nuisances, TakeEquations
+from jawusd.tracking.sequence.nuisance import Nuisances, TakeEquations
 from jawusd.tracking.sequence.passes import Passes, Progress, mark_poorly_seen_lost
 from jawusd.tracking.sequence.results import assemble, outline_variance
 from jawusd.tracking.sequence.take_checks import (
@@ -190,12 +191,9 @@ class _Take(Passes):
 
     def _equations(self, extrinsics: Extrinsics, rest: RestFrames) -> TakeEquations:
         variance = outline_variance(self.records, self._config)
-        equations = TakeEquations(self.records, variance, extrinsics, annotator=self._annotator())
+        equations = TakeEquations(self.records, variance, extrinsics, annotator=drawn_prior(self._solver.scans))
         observe_bite(equations, self.records, rest, extrinsics, variance)
         return equations
-
-    def _annotator(self) -> AnnotatorPrior:
-        return DRAWN if all(scan.shows_gum for scan in self._solver.scans) else DRAWN_BESIDE_CROWNS
 
     def _middle(self) -> Array:
         """Return the centre of the teeth in world coordinates [mm], shape (3,)."""
@@ -222,7 +220,7 @@ class _Take(Passes):
                 views = _corrected_views(views, self.records, frame, found, extrinsics)
                 solution = self._solver.solve(start, views, c.gates_from(0.0), used)
                 records[frame] = replace(records[frame], solution=solution)
-            equations = TakeEquations(records, variance, extrinsics, sample, self._annotator())
+            equations = TakeEquations(records, variance, extrinsics, sample, drawn_prior(self._solver.scans))
             observe_bite(equations, records, sampled_rest, extrinsics, variance)
             more = equations.solve(c, cameras_moved)
             found = found.plus(more)
