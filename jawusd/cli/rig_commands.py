@@ -128,6 +128,10 @@ def _info_lines(found: Description) -> list[str]:
     for name, count in found["meshes"].items():
         mark = ", a placeholder, not anatomical" if name in found["placeholders"] else ""
         lines.append(f"mesh {name}: {count} points{mark}")
+    condyles = found["estimated_condyles"]
+    if condyles:
+        error = "not known" if condyles["error_mm"] is None else f"{condyles['error_mm']:.1f} mm"
+        lines.append(f"estimated head: condyles: {condyles['source']}; expected error: {error}")
     if found["animation"]:
         shown = found["animation"]
         lines.append(f"animation: {shown['samples']} samples, frames {shown['first']:g} .. {shown['last']:g}")

@@ -102,7 +102,11 @@ class AnatomySection(Strict):
     ] = None
     landmarks: Annotated[
         dict[str, tuple[float, float, float]] | None,
-        Key("Points of the mandible in the scans' frame, by name.", "{ lower_incisor = [0.0, -1.0, 2.0] }", "mm"),
+        Key(
+            "Points of mandible and ears (tragion_left, tragion_right) in the scans' frame, by name.",
+            "{ lower_incisor = [0.0, -1.0, 2.0] }",
+            "mm",
+        ),
     ] = None
 
     @field_validator("T_anatomical_skull")

@@ -15,10 +15,19 @@ from jawusd.geometry.so3 import hat
 #: Order of the landmarks in every table and file; all move with the mandible.
 LANDMARKS = ("incisor", "molar_left", "molar_right", "condyle_left", "condyle_right")
 
-# Mean adult distances from the lower incisal point to the condyle centres, used only when there is no mandible mesh:
-# the Bonwill triangle (about 100 mm between the condyles and from each to the incisal point), condyles 37 mm above
-# the occlusal plane.
-_CONDYLE_FROM_INCISOR_MM = np.array([50.0, 36.0, -80.0])
+#: How the description of an inferred landmark names condyles that come from population means.
+MEAN_CONDYLES = "at mean adult positions"
+
+# Used only without a mandible mesh: the mean Bonwill triangle of 120 adults in cone beam CT ("A
+# three-dimensional morphometric study on the position of temporomandibular joints", PubMed 26734666): 99.6 mm between
+# the condyles, 103.3 mm from each to the incisal point, 34.3 mm above the occlusal plane (Balkwill angle 20 degrees).
+_CONDYLES_APART_MM, _CONDYLE_TO_INCISOR_MM, _CONDYLE_ABOVE_MM = 99.6, 103.3, 34.3
+# Change of the distance between the condyles per mm of lower arch width: correlation 0.3 (Dahri et al. 2012, J Pak Dent
+# Assoc 21:141, 100 adults) times the ratio of the standard deviations, about 5 to 2.5 mm.
+_APART_PER_WIDTH = 0.6
+_MEAN_WIDTH_MM, _WIDTH_RANGE_MM = 44.0, (36.0, 52.0)
+# From the tragus of the ear to the condyle centre: 13 mm forward (Beyron's point) and about 20 mm inward.
+_FROM_TRAGION_MM = np.array([-20.0, 0.0, 13.0])
 # Typical posterior and lateral distances of the first molars from the incisal point.
 _MOLAR_BEHIND_INCISOR_MM = 25.0
 _MOLAR_ASIDE_MM = 22.0
@@ -163,14 +172,16 @@ def find_landmarks(
     lower_vertices: ArrayLike,
     mandible_vertices: ArrayLike | None,
     T_anatomical_skull: ArrayLike,
+    tragions: ArrayLike | None = None,
 ) -> Array:
     """Return the five landmarks of `LANDMARKS` on the mandible, mandible (scan) frame [mm], shape (5, 3).
 
     Args:
         lower_vertices: crown vertices of the lower scan, scan frame [mm], shape (N, 3).
         mandible_vertices: mandible mesh in the same frame [mm], shape (M, 3); without it, the condyles are placed at
-            mean adult distances from the incisal point.
+            mean adult distances from the tragions or, without these, from the incisal point.
         T_anatomical_skull: scan frame to anatomical frame with the teeth in occlusion, shape (4, 4).
+        tragions: upper edge of the left and right tragus of the ears, scan frame [mm], shape (2, 3).
     """
     A = np.asarray(T_anatomical_skull, dtype=np.float64)
     lower = transform_points(A, np.asarray(lower_vertices, dtype=np.float64))
@@ -185,12 +196,21 @@ def find_landmarks(
         else:  # the scan has no tooth in this region
             out[row] = [side * _MOLAR_ASIDE_MM, out[0, 1], z]
     if mandible_vertices is None:
-        for row, side in ((3, 1.0), (4, -1.0)):
-            out[row] = out[0] + _CONDYLE_FROM_INCISOR_MM * [side, 1.0, 1.0]
+        out[3:] = _mean_condyles(out[0], out[1, 0] - out[2, 0])
+        if tragions is not None:
+            out[3:] = transform_points(A, tragions) + _FROM_TRAGION_MM * [[1.0, 1.0, 1.0], [-1.0, 1.0, 1.0]]
     else:
         mandible = transform_points(A, np.asarray(mandible_vertices, dtype=np.float64))
         out[3], out[4] = _condyle(mandible, 1.0), _condyle(mandible, -1.0)
     return transform_points(np.linalg.inv(A), out)
+
+
+def _mean_condyles(incisor: Array, arch_width_mm: float) -> Array:
+    """Return the condyles of a mean adult with an arch width between the first molars, anatomical frame, (2, 3)."""
+    wider_mm = np.clip(arch_width_mm, *_WIDTH_RANGE_MM) - _MEAN_WIDTH_MM
+    half = 0.5 * (_CONDYLES_APART_MM + _APART_PER_WIDTH * wider_mm)
+    behind = np.sqrt(_CONDYLE_TO_INCISOR_MM**2 - half**2 - _CONDYLE_ABOVE_MM**2)
+    return incisor + np.array([[side * half, _CONDYLE_ABOVE_MM, -behind] for side in (1.0, -1.0)])
 
 
 def landmark_frame(landmarks: ArrayLike) -> Array:

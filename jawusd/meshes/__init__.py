@@ -1,4 +1,4 @@
-"""Scans and bones: reading, crown labels, rasterisation, solids, collision and contact.
+"""Scans and bones: reading, crown labels, rasterisation, solids, collision, contact and parametric bones.
 
 This package must not import `media`, `capture` or `tracking`.
 """

@@ -20,6 +20,7 @@ from jawusd.formats.mesh import GUM, Mesh, painted_labels, tooth_labels
 from jawusd.formats.model import load_model
 from jawusd.formats.scan_labels import ScanLabels, labels_path, load_scan_labels
 from jawusd.geometry import LANDMARKS, anatomical_frame, find_landmarks, landmark_frame, transform_points
+from jawusd.geometry.anatomy import MEAN_CONDYLES
 
 if TYPE_CHECKING:
     from jawusd.meshes.scan_labels import Labelling
@@ -31,6 +32,8 @@ TEETH = {"upper": "upper_teeth", "lower": "lower_teeth"}
 # with a mean border error below 0.3 mm are below it; plaster casts of patients reach 0.07 to 0.11, a cast without teeth
 # 0.77.
 _WEAK_SHARE = 0.15
+# Facial landmarks that place the condyles of a subject without a mandible mesh.
+_TRAGIONS = ("tragion_left", "tragion_right")
 
 Origin = Literal["file", "paint", "shape"]
 
@@ -235,13 +238,20 @@ def subject_of_capture(capture: Capture, meshes: Mapping[str, Mesh] | None = Non
         meshes: result of `load_meshes`; None: load them.
 
     Raises:
-        CaptureError: a landmark has an unknown name, or the scans are corrupt, swapped or not in occlusion.
+        CaptureError: a landmark has an unknown name, one tragion is missing, or the scans are corrupt, swapped or not
+            in occlusion.
     """
     named = capture.anatomy.landmarks or {}
-    unknown = sorted(set(named) - set(LANDMARKS))
+    known = (*LANDMARKS, *_TRAGIONS)
+    unknown = sorted(set(named) - set(known))
     if unknown:
         raise CaptureError(
-            f'[anatomy.landmarks] has the unknown landmark "{unknown[0]}"; must be one of {", ".join(LANDMARKS)}.',
+            f'[anatomy.landmarks] has the unknown landmark "{unknown[0]}"; must be one of {", ".join(known)}.',
+            path=capture.folder / "capture.toml",
+        )
+    if len(set(named) & set(_TRAGIONS)) == 1:
+        raise CaptureError(
+            "[anatomy.landmarks] has only one of tragion_left and tragion_right. Give both or neither.",
             path=capture.folder / "capture.toml",
         )
     meshes = load_meshes(capture) if meshes is None else meshes
@@ -272,18 +282,19 @@ def _measured(
     else:
         T_anatomical_skull = np.array(axes, dtype=np.float64)
     bone = meshes.get("mandible")
-    landmarks = find_landmarks(crowns["lower_teeth"], None if bone is None else bone.vertices, T_anatomical_skull)
+    tragions = np.array([named[name] for name in _TRAGIONS]) if _TRAGIONS[0] in named else None
+    vertices = None if bone is None else bone.vertices
+    landmarks = find_landmarks(crowns["lower_teeth"], vertices, T_anatomical_skull, tragions)
     for index, landmark in enumerate(LANDMARKS):
         if landmark in named:
             landmarks[index] = named[landmark]
         else:
             source = "from the scans"
             if landmark.startswith("condyle"):
-                source = (
-                    "from the mandible mesh"
-                    if bone is not None
-                    else "at mean adult positions, as there is no mandible mesh"
+                means = (
+                    f"{MEAN_CONDYLES}{'' if tragions is None else ' from the tragions'}, as there is no mandible mesh"
                 )
+                source = means if bone is None else "from the mandible mesh"
             inferred.append(f"{landmark}, {source}")
     return Subject(name, T_anatomical_skull, landmarks, meshes, fps, inferred=tuple(inferred))
 

@@ -26,6 +26,7 @@ from jawusd.rig.attributes import write_arrays
 from jawusd.rig.geo import MESH_PATHS, build_geometry, extent, hide_look
 from jawusd.rig.layers import apply_jaw_api, define_prim, new_layer, set_attribute, set_relationship, stage_of
 from jawusd.rig.layout import ACTOR, BOTH, DETAIL, MANDIBLE, PROXY, PROXY_FILE, PROXY_SUFFIX, SCAN
+from jawusd.rig.placeholder import Estimate
 from jawusd.rig.table import DecoderTable, grid_points, sample_valid
 
 _TYPES = Sdf.ValueTypeNames
@@ -36,18 +37,18 @@ _DECODER_ARRAYS = ("jaw:model:", "jaw:bounds:", "jaw:contact:", "jaw:joints:", "
 
 
 def proxy_layer(
-    proxies: Mapping[str, Mesh], meshes: Mapping[str, Mesh], T_rest: Array, placeholder: str | None
+    proxies: Mapping[str, Mesh], meshes: Mapping[str, Mesh], T_rest: Array, estimate: Estimate | None
 ) -> Sdf.Layer:
     """Build `proxy.usdc`: the content of `geo.usdc` with proxies in place of meshes, and a class that adds them.
 
     Args:
         proxies: Proxies for some of the meshes, with the same names and coordinate frames [mm].
-        meshes, T_rest, placeholder: As for `build_geometry`.
+        meshes, T_rest, estimate: As for `build_geometry`.
 
     Raises:
         RigError: A mesh without faces or with values that are not finite.
     """
-    layer = build_geometry({**meshes, **proxies}, T_rest, placeholder)
+    layer = build_geometry({**meshes, **proxies}, T_rest, estimate)
     _define_proxy_class(layer, proxies)
     stage = stage_of(layer)
     for name, proxy in proxies.items():

@@ -32,7 +32,7 @@ from jawusd.rig.layout import (
     check_prim_name,
 )
 from jawusd.rig.onnx_sidecar import check_written, decode_model, encode_model, write_onnx
-from jawusd.rig.placeholder import grow_placeholder
+from jawusd.rig.placeholder import with_estimated_bones
 from jawusd.rig.publish import write_package
 from jawusd.rig.skel import write_skel
 from jawusd.rig.table import DEFAULT_SIZE, build_table
@@ -53,8 +53,8 @@ def bake_rig(
 ) -> list[Path]:
     """Write a rig: interface, decoder, geometry, ONNX graphs, captured motion if there is one, skeleton, package.
 
-    A missing mandible mesh is replaced by a placeholder grown from the lower scan, and marked as such. Every file is
-    written atomically, `actor.usda` after the files it refers to.
+    A missing mandible mesh, and a missing skull with it, are replaced by estimated bones, which are marked as
+    placeholders. Every file is written atomically, `actor.usda` after the files it refers to.
 
     Args:
         folder: Output folder; created if missing.
@@ -82,16 +82,13 @@ def bake_rig(
         raise RigError(f"the frame rate is {fps}; it must be greater than 0.", path=folder)
     check_meshes(meshes)
     check_prim_name(prim_name)
-    placeholder = None
-    if "mandible" not in meshes:
-        grown = grow_placeholder(rig, meshes["lower_teeth"])
-        meshes, placeholder = {**meshes, "mandible": grown.mesh}, grown.source
-    geometry = build_geometry(meshes, rig.T_rest, placeholder)
+    meshes, estimate = with_estimated_bones(rig, meshes)
+    geometry = build_geometry(meshes, rig.T_rest, estimate)
     moving = np.concatenate([meshes[key].vertices for key in ("mandible", "lower_teeth")])
     table = build_table(rig, moving, table_size)
     written = [write_layer(rename_actor(geometry, prim_name), folder / GEO_FILE)]
     if proxies:
-        thinned = proxy_layer(proxies, meshes, rig.T_rest, placeholder)
+        thinned = proxy_layer(proxies, meshes, rig.T_rest, estimate)
         written.append(write_layer(rename_actor(thinned, prim_name), folder / PROXY_FILE))
     written += [
         write_layer(rename_actor(decoder_layer(rig, table), prim_name), folder / RIG_FILE),

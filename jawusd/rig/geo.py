@@ -18,6 +18,7 @@ from jawusd.rig import _gf
 from jawusd.rig.attributes import value_of
 from jawusd.rig.layers import add_pose, define_prim, new_layer, set_attribute, stage_of
 from jawusd.rig.layout import ACTOR, GEO, MANDIBLE, MATERIALS, SKULL, rig_prims
+from jawusd.rig.placeholder import Estimate
 from jawusd.rig.read import find_rig_prim, open_stage
 from jawusd.rig.untrusted import raises_format_error
 
@@ -96,15 +97,14 @@ def srgb_from_linear(values: Array) -> NDArray[np.uint8]:
     return np.round(255 * coded).astype(np.uint8)
 
 
-def build_geometry(meshes: Mapping[str, Mesh], T_rest: Array, placeholder: str | None = None) -> Sdf.Layer:
+def build_geometry(meshes: Mapping[str, Mesh], T_rest: Array, estimate: Estimate | None = None) -> Sdf.Layer:
     """Build the layer with all meshes under /Actor.
 
     Args:
         meshes: `upper_teeth` and `skull` in the skull frame, `lower_teeth` and `mandible` in the mandible frame [mm];
             `skull` and `mandible` may be missing.
         T_rest: T_skull_mandible with the teeth closed, shape (4, 4): the mandible's default pose.
-        placeholder: Source of the condyle positions if the mandible mesh is a placeholder, which is then marked as one;
-            otherwise None.
+        estimate: The estimated bones among the meshes, which are marked as placeholders; None without any.
 
     Raises:
         RigError: An unknown or missing mesh, or a mesh without faces or with values that are not finite.
@@ -123,26 +123,29 @@ def build_geometry(meshes: Mapping[str, Mesh], T_rest: Array, placeholder: str |
     for path in (SKULL, MANDIBLE):
         Usd.ModelAPI(stage.GetPrimAtPath(path)).SetKind(Kind.Tokens.subcomponent)
     add_pose(stage.GetPrimAtPath(MANDIBLE), T_rest)
-    replaced = "mandible" if placeholder is not None else None
+    replaced = () if estimate is None else estimate.bones
     used = [name for name in MATERIAL_LOOKS if name != "Placeholder" or replaced]
     materials = {name: _material(stage, name) for name in used}
     for name, path in MESH_PATHS.items():
         if name in meshes:
-            base = "Enamel" if name.endswith("teeth") else "Placeholder" if name == replaced else "Bone"
+            base = "Enamel" if name.endswith("teeth") else "Placeholder" if name in replaced else "Bone"
             _define_mesh(stage, path, meshes[name], materials, base)
-    if placeholder is not None:
-        _mark_placeholder(layer.GetPrimAtPath(MESH_PATHS["mandible"]), placeholder)
+    if estimate is not None:
+        for name in estimate.bones:
+            _mark_placeholder(layer.GetPrimAtPath(MESH_PATHS[name]), name, estimate)
     return layer
 
 
-def _mark_placeholder(mesh: Sdf.PrimSpec, condyles: str) -> None:
+def _mark_placeholder(mesh: Sdf.PrimSpec, name: str, estimate: Estimate) -> None:
     """Mark a mesh as a placeholder in all metadata that programs display."""
-    text = f"Not anatomy: a placeholder grown from the lower scan; there was no mandible mesh. Condyles: {condyles}."
-    mesh.SetInfo("displayName", "Mandible (placeholder)")
+    text = f"Not anatomy: a placeholder estimated from the scans; there was no mesh. Condyles: {estimate.condyles}."
+    mesh.SetInfo("displayName", f"{name.capitalize()} (placeholder)")
     mesh.SetInfo("documentation", text)
     mesh.customData = {"placeholder": True}
     set_attribute(mesh, "jaw:placeholder", Sdf.ValueTypeNames.Bool, True)
-    set_attribute(mesh, "jaw:placeholder:condyles", Sdf.ValueTypeNames.String, condyles)
+    set_attribute(mesh, "jaw:placeholder:condyles", Sdf.ValueTypeNames.String, estimate.condyles)
+    if estimate.error_mm is not None:
+        set_attribute(mesh, "jaw:placeholder:condyleError", Sdf.ValueTypeNames.Double, estimate.error_mm)
 
 
 def extent(vertices: Array) -> Array:

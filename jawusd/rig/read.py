@@ -201,6 +201,7 @@ class Description(TypedDict):
     animation: dict[str, float] | None
     meshes: dict[str, int]
     placeholders: list[str]
+    estimated_condyles: dict[str, str | float | None] | None
     contact: object
     joints: object
     speeds: dict[str, list[float]] | None
@@ -218,6 +219,7 @@ def describe(path: PathArg, prim_path: str | None = None) -> Description:
     samples = key_times(prim.GetAttribute(PARAMETERS[0]))
     animation = {"samples": len(samples), "first": samples[0], "last": samples[-1]} if samples else None
     onnx = [prim.GetAttribute(name).Get() for name in ONNX_ATTRIBUTES]
+    placeholders = [p for p in meshes_below(prim) if p.GetAttribute("jaw:placeholder").Get()]
     return {
         "file": str(path),
         "prim": str(prim.GetPath()),
@@ -243,12 +245,23 @@ def describe(path: PathArg, prim_path: str | None = None) -> Description:
         "fps": stage.GetTimeCodesPerSecond(),
         "animation": animation,
         "meshes": _meshes(prim, path),
-        "placeholders": [p.GetName() for p in meshes_below(prim) if p.GetAttribute("jaw:placeholder").Get()],
+        "placeholders": [mesh.GetName() for mesh in placeholders],
+        "estimated_condyles": _estimated_condyles(placeholders),
         "contact": rig.meta.get("contact"),
         "joints": rig.meta.get("joints"),
         "speeds": _speeds(rig),
         "errors": rig.meta.get("errors"),
     }
+
+
+def _estimated_condyles(placeholders: list[Usd.Prim]) -> dict[str, str | float | None] | None:
+    """Return source and expected error [mm] of the condyles of placeholders; None without placeholders."""
+    if not placeholders:
+        return None
+    source, error = (
+        placeholders[0].GetAttribute(f"jaw:placeholder:{name}").Get() for name in ("condyles", "condyleError")
+    )
+    return {"source": source, "error_mm": error}
 
 
 def _speeds(rig: JawRig) -> dict[str, list[float]] | None:

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from jawusd.base.arrays import Array
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry import transform_points
-from jawusd.synthetic.bones import build_mandible, build_skull
+from jawusd.meshes.bones import build_mandible, build_skull
 from jawusd.synthetic.dental_arch import ArchShape, DentalArch, build_arch
 from jawusd.synthetic.person import Person
 from jawusd.synthetic.teeth import LOWER, UPPER

@@ -11,8 +11,8 @@ from jawusd.base.arrays import Array, Mask
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry import Camera, transform_points
 from jawusd.geometry.points import meet_triangles
+from jawusd.meshes.surfaces import vertex_normals
 from jawusd.synthetic.dental_arch import DentalArch
-from jawusd.synthetic.surfaces import vertex_normals
 
 # Outline jitter: amplitude and cell size [px] at an image height of 1080 px, fraction of the variance that is constant
 # over time, and frame-to-frame correlation of the variable part.

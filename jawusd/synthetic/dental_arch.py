@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from jawusd.base.arrays import Array
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry import so3_exp
-from jawusd.synthetic.surfaces import Faces, loft, merged, outward
+from jawusd.meshes.surfaces import Faces, loft, merged, outward
 from jawusd.synthetic.teeth import CrownForm, crown
 
 RED, GREEN, GREY = (215, 45, 40), (40, 190, 60), (150, 150, 150)

@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike
 
 from jawusd.base.arrays import Array
 from jawusd.geometry import make_transform, so3_exp
+from jawusd.meshes.bones import JointShape, eminence_path
 
 # Pitch [rad] at which the tooth guidance, a Gaussian of pitch, has decreased by a factor of e.
 _CONTACT_FADE_RAD = np.deg2rad(4.0)
@@ -25,14 +26,9 @@ _CUSP_ROUNDING_MM = 0.3
 
 
 @dataclass(frozen=True)
-class Joint:
+class Joint(JointShape):
     """Parameters of one subject's joint; pairs are (left, right), lengths are in mm, angles in rad."""
 
-    condyles: Array  # centres of the condyles at rest, shape (2, 3)
-    incisor: Array  # lower incisal point at rest, shape (3,)
-    eminence_height_mm: Array  # drop of each eminence from fossa to crest, shape (2,)
-    eminence_width_mm: Array  # half width of the slope, shape (2,)
-    eminence_start_mm: Array  # forward distance from rest to the steepest point, shape (2,)
     medial_slope: Array  # drop of a condyle per mm towards the midline, shape (2,)
     bennett_rad: Array  # angle between each condyle's path on the balancing side and the sagittal plane, shape (2,)
     side_shift_mm: Array  # immediate side shift towards each working side, shape (2,)
@@ -57,11 +53,6 @@ class Joint:
         """Return the forward distance from the condylar axis to the lower incisors [mm]."""
         return float(self.incisor[2] - self.condyles[:, 2].mean())
 
-    @property
-    def condylar_distance_mm(self) -> float:
-        """Return the distance between the condyle centres [mm], the same in every pose."""
-        return float(np.linalg.norm(self.condyles[0] - self.condyles[1]))
-
 
 def smoothstep(x: ArrayLike) -> Array:
     """Return a smooth step from 0 to 1 for x in 0..1, with zero slope at both ends; x has any shape."""
@@ -72,8 +63,7 @@ def smoothstep(x: ArrayLike) -> Array:
 def eminence(joint: Joint, side: int, slide_mm: ArrayLike, medial_mm: ArrayLike = 0.0) -> Array:
     """Return the height of a condyle centre relative to rest [mm], negative down the eminence.
 
-    The sagittal section is an S curve in closed form (concave fossa, slope, convex crest), flat far in front and
-    behind.
+    The sagittal section is `eminence_path`.
 
     Args:
         side: 0 left, 1 right.
@@ -81,9 +71,9 @@ def eminence(joint: Joint, side: int, slide_mm: ArrayLike, medial_mm: ArrayLike 
         medial_mm: displacement of the condyle towards the midline, same shape.
     """
     slide = np.asarray(slide_mm, dtype=np.float64)
-    start, width = joint.eminence_start_mm[side], joint.eminence_width_mm[side]
-    height = -joint.eminence_height_mm[side] / 2 * (np.tanh((slide - start) / width) + np.tanh(start / width))
-    return height - joint.medial_slope[side] * np.asarray(medial_mm) * smoothstep(slide / 8.0)
+    return eminence_path(joint, side, slide) - joint.medial_slope[side] * np.asarray(medial_mm) * smoothstep(
+        slide / 8.0
+    )
 
 
 def joint_pose(

@@ -15,9 +15,9 @@ from numpy.typing import ArrayLike, NDArray
 from jawusd.base.arrays import Array
 from jawusd.base.errors import MissingDependencyError
 from jawusd.geometry import Camera, se3_inverse
+from jawusd.meshes.surfaces import vertex_normals
 from jawusd.synthetic import shaders
 from jawusd.synthetic.soft_tissue import Surface
-from jawusd.synthetic.surfaces import vertex_normals
 
 NEAR_MM, FAR_MM = 80.0, 700.0
 #: Labels of surfaces; surfaces of every label can occlude the teeth.

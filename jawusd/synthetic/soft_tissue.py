@@ -13,8 +13,8 @@ from numpy.typing import ArrayLike
 
 from jawusd.base.arrays import Array
 from jawusd.geometry import transform_points
+from jawusd.meshes.surfaces import Faces, grid_faces
 from jawusd.synthetic.kinematics import smoothstep
-from jawusd.synthetic.surfaces import Faces, grid_faces
 
 _COLUMNS = 160
 _SKIN_ROWS = 30

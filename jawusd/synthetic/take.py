@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from jawusd.base.arrays import Array, Mask
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry import Camera, make_transform, se3_inverse, so3_exp, transform_points
+from jawusd.meshes.surfaces import grid_faces
 from jawusd.synthetic.anatomy import Occlusion, PersonAnatomy, opened_bite
 from jawusd.synthetic.dental_arch import DentalArch
 from jawusd.synthetic.exercises import schedule, smooth_noise, smoothed
@@ -21,7 +22,6 @@ from jawusd.synthetic.kinematics import smoothstep
 from jawusd.synthetic.person import Person
 from jawusd.synthetic.render import LOWER_TEETH, UPPER_TEETH, Picture, Renderer
 from jawusd.synthetic.soft_tissue import Face, LipState, Surface, palate, tongue
-from jawusd.synthetic.surfaces import grid_faces
 
 #: Scan frame to world with the head at rest; the world is the first camera's frame: x right, y down, z forward.
 T_WORLD_SCAN = make_transform(np.diag([1.0, -1.0, -1.0]), [0.0, -14.0, 214.0])

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jawusd.base.arrays import Array
-from jawusd.synthetic.surfaces import loft, superellipse
+from jawusd.meshes.surfaces import loft, superellipse
 
 #: Height of the part of the crown that is hidden below the gum line [mm].
 ROOT_MM = 2.5

@@ -24,7 +24,7 @@ from jawusd.viewer.widgets import begin_panel, guarded, small_text
 FREE_DEPTH: Literal["shift"] = "shift"
 _PANEL_PX, _PLOTS_PX = 350, 310
 _PLACEHOLDER = small_text(
-    "<b>The mandible is a placeholder:</b> the rig was built without a mandible mesh. It shows the motion of teeth and "
+    "<b>The bone is estimated:</b> the rig was built without a mandible mesh. It shows the motion of teeth and "
     "condyles, not the shape of the bone.",
     f"color:{VERMILION}",
 )

@@ -73,9 +73,8 @@ class JawScene:
             if name in actor.meshes:
                 mesh = actor.meshes[name]
                 placed = Mesh(transform_points(self._T_world_skull, mesh.vertices), mesh.faces)
-                self._add_mesh(
-                    f"/{name}", placed, _COLORS.get(name, _BONE), _SKULL_OPACITY if name == "skull" else None
-                )
+                color = _PLACEHOLDER if name in actor.placeholders else _COLORS.get(name, _BONE)
+                self._add_mesh(f"/{name}", placed, color, _SKULL_OPACITY if name == "skull" else None)
         self._jaw = self._scene.add_frame("/jaw", show_axes=False)
         moving = [name for name in MOVING if name in actor.meshes]
         self._bone = _PLACEHOLDER if "mandible" in actor.placeholders else _BONE

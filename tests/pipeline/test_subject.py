@@ -12,9 +12,11 @@ from package_copy import ROOT
 from jawusd.base.errors import CaptureError, FormatError, RigError
 from jawusd.formats.model import JawModel, save_model
 from jawusd.geometry import LANDMARKS, landmark_frame
+from jawusd.geometry.anatomy import MEAN_CONDYLES
 from jawusd.pipeline.bake import bake_subject
 from jawusd.pipeline.capture_inputs import open_capture
 from jawusd.pipeline.subject import (
+    load_meshes,
     registered_subject,
     subject_of_build,
     subject_of_capture,
@@ -65,7 +67,24 @@ def test_loose_scans_say_the_same_as_the_capture_they_belong_to():
     assert len(loose.measured_points()) == len(capture.measured_points())
     without = subject_of_scans(SCANS, "someone")
     np.testing.assert_array_equal(without.measured_points(), without.meshes["lower_teeth"].vertices)
-    assert any("mean adult positions" in text for text in without.inferred)
+    # the rig looks for these words before it takes the condyles from the motion
+    assert any(text.startswith("condyle_left") and MEAN_CONDYLES in text for text in without.inferred)
+
+
+def with_landmarks(**named):
+    """Return the example's capture without its bones, with named landmarks."""
+    capture = open_capture(ROOT / "examples" / "capture")
+    capture = capture.model_copy(update={"anatomy": capture.anatomy.model_copy(update={"landmarks": named})})
+    meshes = load_meshes(capture)
+    return subject_of_capture(capture, {name: meshes[name] for name in ("upper_teeth", "lower_teeth")})
+
+
+def test_ears_place_the_condyles_of_a_subject_without_bones():
+    found = with_landmarks(tragion_left=(75.0, 40.0, -95.0), tragion_right=(-75.0, 40.0, -95.0))
+    np.testing.assert_allclose(found.landmarks[3:], [[55, 40, -82], [-55, 40, -82]], atol=1.5)
+    assert any("from the tragions" in text for text in found.inferred)
+    with pytest.raises(CaptureError, match="only one of tragion_left and tragion_right"):
+        with_landmarks(tragion_left=(75.0, 40.0, -95.0))
 
 
 def test_a_scan_that_is_none_is_named():

@@ -1,4 +1,4 @@
-"""The placeholder for a missing mandible: closed, in the place of the jaw, condyles from the motion, and marked."""
+"""The estimated head of a subject without bones: closed, in place, condyles from the motion, and marked."""
 
 import types
 
@@ -8,14 +8,14 @@ import trimesh
 from example_rig import FPS, assert_valid_usd, example_meshes, example_motion, example_rig
 from pxr import Usd, UsdGeom, UsdShade
 
-from jawusd.formats.mesh import Mesh
 from jawusd.geometry import LANDMARKS, make_transform, so3_exp
+from jawusd.geometry.anatomy import MEAN_CONDYLES
 from jawusd.rig import describe
 from jawusd.rig.bake import bake_rig
-from jawusd.rig.placeholder import find_condyles, grow_placeholder
+from jawusd.rig.placeholder import CONDYLE_ERROR_MM, find_condyles, with_estimated_bones
 
 MEAN = np.array([[50.0, 36.0, -80.0], [-50.0, 36.0, -80.0]])  # the mean adult positions
-INFERRED = {"inferred": ["condyle_left, at mean adult places", "condyle_right, at mean adult places"]}
+INFERRED = {"inferred": [f"condyle_left, {MEAN_CONDYLES}, as", f"condyle_right, {MEAN_CONDYLES}, as"]}
 
 
 def sliding_jaw(condyles, meta=INFERRED, travel_mm=9.0, noise_mm=0.05):
@@ -48,7 +48,7 @@ def test_condyles_come_from_the_motion(offset):
 def test_a_motion_that_cannot_tell_leaves_the_mean_places():
     for rig in (sliding_jaw(MEAN + [0, -10, -4], travel_mm=2.0), sliding_jaw(MEAN + [0, -10, -4], noise_mm=2.0)):
         found, source = find_condyles(rig)
-        assert source == "mean adult places"
+        assert source == "mean adult positions"
         np.testing.assert_array_equal(found, MEAN)
 
 
@@ -74,31 +74,54 @@ def winding(mesh, point):
     return 2 * np.arctan2(np.einsum("ij,ij->i", a, np.cross(b, c)), below).sum() / (4 * np.pi)
 
 
-def test_it_is_a_closed_body_below_the_scan_with_heads_at_the_condyles(kind):
-    rig, lower = example_rig(kind), example_meshes()["lower_teeth"]
-    grown = grow_placeholder(rig, lower)
-    made = closed(grown.mesh)
+def scans():
+    """Return the meshes of the example without its bones."""
+    return {name: mesh for name, mesh in example_meshes().items() if name.endswith("teeth")}
+
+
+def test_bones_are_closed_with_the_body_below_the_scan_and_heads_at_the_condyles(kind):
+    rig, meshes = example_rig(kind), scans()
+    found, estimate = with_estimated_bones(rig, meshes)
+    made = closed(found["mandible"])
+    closed(found["skull"])
+    assert set(estimate.bones) == {"mandible", "skull"} and estimate.error_mm is None
     condyles = rig.landmarks[[LANDMARKS.index(name) for name in ("condyle_left", "condyle_right")]]
-    np.testing.assert_allclose(grown.condyles, condyles)
-    assert all(winding(made, point) == pytest.approx(1) for point in condyles)
+    assert all(winding(made, point) >= 0.99 for point in condyles)
     A = (rig.T_anatomical_skull @ rig.T_rest)[:3, :3]
-    height = grown.mesh.vertices @ A[1]
-    assert height.min() < (lower.vertices @ A[1]).min() - 10
+    height = found["mandible"].vertices @ A[1]
+    assert height.min() < (meshes["lower_teeth"].vertices @ A[1]).min() - 10
     assert height.max() < (condyles @ A[1]).max() + 8
 
 
-def test_a_scan_of_few_teeth_gives_a_body_too():
-    rig, lower = example_rig(), example_meshes()["lower_teeth"]
-    near = np.linalg.norm(lower.vertices - rig.landmarks[0], axis=1) < 8
-    faces = lower.faces[near[lower.faces].all(axis=1)]
-    used, renamed = np.unique(faces, return_inverse=True)
-    closed(grow_placeholder(rig, Mesh(lower.vertices[used], renamed.reshape(-1, 3))).mesh)
+def test_a_wider_arch_widens_the_body_and_not_the_rami():
+    rig, meshes = example_rig(), scans()
+    T = rig.T_anatomical_skull @ rig.T_rest
+    widths = []
+    for wider_mm in (0.0, 4.0):
+        landmarks = rig.landmarks.copy()
+        landmarks[1:3] += 0.5 * wider_mm * np.array([[1.0], [-1.0]]) * T[0, :3]
+        shown = types.SimpleNamespace(T_anatomical_skull=rig.T_anatomical_skull, T_rest=rig.T_rest)
+        shown.landmarks, shown.inferred = landmarks, ()
+        points = with_estimated_bones(shown, meshes)[0]["mandible"].vertices @ T[:3, :3].T + T[:3, 3]
+        front = points[points[:, 2] > points[:, 2].max() - 40.0]
+        widths.append([np.ptp(front[:, 0]), np.ptp(points[:, 0])])
+    assert 2.0 < widths[1][0] - widths[0][0] < 10.0
+    assert widths[1][1] == pytest.approx(widths[0][1], abs=1e-6)
+
+
+def test_given_bones_stay():
+    rig, meshes = example_rig(), example_meshes()
+    assert with_estimated_bones(rig, meshes) == (meshes, None)
+    given = {name: mesh for name, mesh in meshes.items() if name != "mandible"}
+    found, estimate = with_estimated_bones(rig, given)
+    assert estimate.bones == ("mandible",) and found["skull"] is meshes["skull"]
 
 
 def test_it_is_marked_wherever_it_goes(tmp_path, kind):
-    meshes = {name: mesh for name, mesh in example_meshes().items() if name != "mandible"}
+    rig = example_rig(kind)
+    rig.meta["inferred"] = [f"condyle_left, {MEAN_CONDYLES}, as there is no mandible mesh"]
     frames, d = example_motion()
-    bake_rig(tmp_path, example_rig(kind), meshes, name="x", fps=FPS, frames=frames, d=d, table_size=17)
+    bake_rig(tmp_path, rig, scans(), name="x", fps=FPS, frames=frames, d=d, table_size=17)
     for file in ("actor.usda", "anim_capture.usdc", "actor.usdz", "actor_skel.usdc"):
         assert_valid_usd(tmp_path / file)
         stage = Usd.Stage.Open(str(tmp_path / file))
@@ -107,10 +130,15 @@ def test_it_is_marked_wherever_it_goes(tmp_path, kind):
         assert prim.GetCustomDataByKey("placeholder") is True
         attribute = prim.GetAttribute("jaw:placeholder")
         assert attribute.Get() is True and attribute.IsCustom()
-        assert prim.GetAttribute("jaw:placeholder:condyles").Get() == "landmarks of the model"
+        source = prim.GetAttribute("jaw:placeholder:condyles").Get()
+        assert prim.GetAttribute("jaw:placeholder:condyleError").Get() == CONDYLE_ERROR_MM[source] > 0
         material, _ = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()
         assert material.GetPrim().GetName() == "Placeholder"
-    assert describe(tmp_path / "actor.usda")["placeholders"] == ["MandibleMesh"]
+    assert describe(tmp_path / "actor.usda")["placeholders"] == ["SkullMesh", "MandibleMesh"]
+    assert describe(tmp_path / "actor.usda")["estimated_condyles"] == {
+        "source": source,
+        "error_mm": CONDYLE_ERROR_MM[source],
+    }
 
 
 def test_a_given_mandible_bears_no_mark(anchored_folder):

@@ -5,8 +5,8 @@ import pytest
 import trimesh
 
 from jawusd.geometry import anatomical_frame, find_landmarks, transform_points
+from jawusd.meshes.bones import JOINT_SPACE_MM
 from jawusd.synthetic.anatomy import PersonAnatomy, build_anatomy, opened_bite
-from jawusd.synthetic.bones import JOINT_SPACE_MM
 from jawusd.synthetic.dental_arch import GREEN, GREY, RED, DentalArch
 from jawusd.synthetic.person import Person
 

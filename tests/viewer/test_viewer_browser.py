@@ -200,7 +200,7 @@ def test_a_placeholder_of_the_mandible_is_shown_as_one(chromium, tmp_path):
     bake_rig(tmp_path, example_rig(), meshes, name="toothless", fps=FPS, frames=frames, d=d, table_size=17)
     viewer = open_viewer(tmp_path, "127.0.0.1", 0, play=False)
     tab = Tab(chromium, viewer)
-    tab.said("The mandible is a placeholder")
+    tab.said("The bone is estimated")
     mandible = tab.page.scene.grips[0]
     assert mandible.name == "/jaw/mandible" and mandible.opacity < 0.6
     tab.picture("placeholder")

@@ -13,6 +13,7 @@ import numpy as np
 from jawusd.base.arrays import Array
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry import so3_exp
+from jawusd.meshes.surfaces import Faces, loft, merged, outward
 from jawusd.synthetic.dental_arch import (
     COLUMN_MM,
     CONTACT_MM,
@@ -24,7 +25,6 @@ from jawusd.synthetic.dental_arch import (
     crown_colors,
     gum_ridge,
 )
-from jawusd.synthetic.surfaces import Faces, loft, merged, outward
 from jawusd.synthetic.teeth import CrownForm, crown
 from subjects.traits import ArchTraits, Gums, Traits
 

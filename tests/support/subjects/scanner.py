@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from jawusd.base.arrays import Array
 from jawusd.formats.mesh import GUM, Mesh, tooth_labels
 from jawusd.meshes.remeshing import decimated
+from jawusd.meshes.surfaces import Faces, merged, vertex_normals
 from jawusd.synthetic.dental_arch import GREY, RED
-from jawusd.synthetic.surfaces import Faces, merged, vertex_normals
 
 Paint = Literal["painted", "natural", "none"]
 _ENAMEL, _PINK = np.array([214.0, 204.0, 180.0]), np.array([196.0, 116.0, 112.0])
