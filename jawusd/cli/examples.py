@@ -34,6 +34,7 @@ EXAMPLES = {
     "solve": (
         "jawusd solve out shot -o take.usdc",
         "jawusd solve out shot -o take.npz --overlay take.mp4 --report take.html",
+        "jawusd solve out shot --skin skin.npz --face face.csv -o take.npz",
     ),
     "live": ("jawusd live out shot --source left=/dev/video0 --osc 127.0.0.1:9000 --view",),
     "rebake": ("jawusd rebake shot.usda -o jaws.usdc", "jawusd rebake out export.fbx -o anim_edited.usdc"),

@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from jawusd.cli.options import Allow, Force, Json, Outside, Prim, RigArg
+from jawusd.cli.options import Allow, Force, Json, LengthUnit, Outside, Prim, RigArg, UnitOption, rigid_bodies
 from jawusd.cli.output import emit, progress, say
+from jawusd.cli.skin_command import RestFrame, Rigid
 from jawusd.formats.atomic import refuse_existing
 from jawusd.formats.finding import Finding
 
@@ -33,6 +34,41 @@ class Focal(StrEnum):
 
 
 ShotArg = Annotated[Path, typer.Argument(help="capture.toml of the shot, or its folder.", show_default=False)]
+OverlayFile = Annotated[
+    Path | None,
+    typer.Option(
+        help="Video (.mp4) to write of the solved teeth over all cameras side by side.",
+        show_default=False,
+    ),
+]
+ReportFile = Annotated[
+    Path | None,
+    typer.Option(
+        help="Page (.html) to write: curves with expected errors, frames with hidden teeth, findings, images.",
+        show_default=False,
+    ),
+]
+SkinFile = Annotated[
+    Path | None,
+    typer.Option(
+        help="Map from facial skin to d, from skin-fit, for frames with hidden teeth. Needs --face.",
+        show_default=False,
+    ),
+]
+FaceFile = Annotated[
+    Path | None,
+    typer.Option(
+        help="The face during the shot, as for skin-fit, with the points or columns of --skin.", show_default=False
+    ),
+]
+FaceFps = Annotated[
+    float | None, typer.Option(min=0.001, help="Frames per second of the face. Default: that of the file.")
+]
+FaceOffset = Annotated[
+    float | None,
+    typer.Option(help="Seconds from the shot's frame 0 to the face's. Default: estimated from visible teeth."),
+]
+SkinOnly = Annotated[bool, typer.Option("--skin-only", help="Ignore the images: no frame of the shot shows the teeth.")]
 
 
 def solve(
@@ -41,22 +77,18 @@ def solve(
     out: Annotated[
         Path, typer.Option("-o", "--out", help="Table of d (.csv), tracks (.npz) or animation layer (.usdc).")
     ] = Path("take.csv"),
-    overlay: Annotated[
-        Path | None,
-        typer.Option(
-            help="Video (.mp4) to write of the solved teeth over all cameras side by side.",
-            show_default=False,
-        ),
-    ] = None,
-    report: Annotated[
-        Path | None,
-        typer.Option(
-            help="Page (.html) to write: curves with expected errors, frames with hidden teeth, findings, images.",
-            show_default=False,
-        ),
-    ] = None,
+    overlay: OverlayFile = None,
+    report: ReportFile = None,
     head: Annotated[Head, typer.Option(help="fixed: the cameras are head-mounted.")] = Head.free,
     focal: Annotated[Focal, typer.Option(help="free: estimate focal lengths from the take.")] = Focal.known,
+    skin: SkinFile = None,
+    face: FaceFile = None,
+    face_fps: FaceFps = None,
+    offset: FaceOffset = None,
+    rigid: Rigid = None,
+    rest_frame: RestFrame = None,
+    length_unit: UnitOption = LengthUnit.mm,
+    skin_only: SkinOnly = False,
     jobs: Annotated[int, typer.Option(min=1, max=64, help="Number of threads.")] = 2,
     force: Force = False,
     allow_outside: Outside = False,
@@ -66,7 +98,14 @@ def solve(
 ) -> None:
     """Track a performance of a subject with a rig, from masks or, without masks, videos of one or more cameras."""
     from jawusd.pipeline import solve as stage
+    from jawusd.pipeline.solve_videos import SkinOptions
 
+    given = None
+    if skin is not None and face is not None:
+        bodies = rigid_bodies(rigid)
+        given = SkinOptions(skin, face, face_fps, offset, length_unit.value, bodies, rest_frame, skin_only)
+    elif skin is not None or face is not None or skin_only:
+        raise typer.BadParameter("needs both --skin and --face.", param_hint="--skin")
     stage.check_output(rig, out, overlay, report)
     written = [path for path in (out, overlay, report) if path is not None]
     for path in written:
@@ -83,6 +122,7 @@ def solve(
             free_focal=focal is Focal.free,
             jobs=jobs,
             allow_outside=allow_outside,
+            skin=given,
             progress=tell,
         )
     summary = stage.solve_summary(found)
@@ -95,8 +135,15 @@ _LISTED_RUNS = 20
 
 def solve_lines(summary: SolveSummary) -> list[str]:
     """Return `solve_summary` as text."""
-    lines = [f"solved {summary['solved']} of {summary['frames']} frames with {', '.join(summary['cameras'])}"]
-    for word, runs in (("interpolated from the motion around", summary["carried"]), ("lost", summary["lost"])):
+    seen_by = ", ".join(summary["cameras"]) or "no camera"
+    lines = [f"solved {summary['solved']} of {summary['frames']} frames with {seen_by}"]
+    if "skin_offset_s" in summary:
+        lines.append(f"  the face starts {summary['skin_offset_s']:.3f} s after frame 0 of the shot")
+    for word, runs in (
+        ("estimated from facial skin", summary["skin"]),
+        ("interpolated from the motion around", summary["carried"]),
+        ("lost", summary["lost"]),
+    ):
         if runs:
             more = "" if len(runs) <= _LISTED_RUNS else f" and {len(runs) - _LISTED_RUNS} more runs"
             listed = ", ".join(f"{a}" if a == b else f"{a}-{b}" for a, b in runs[:_LISTED_RUNS])

@@ -24,6 +24,7 @@ class SolveState(IntEnum):
     LOST = 0  # no pose fits the images; the pose is interpolated
     SOLVED = 1  # both arches were found
     CARRIED = 2  # an arch is hidden (closed lips, no image); the pose is interpolated
+    SKIN = 3  # an arch was not found; d is estimated from facial skin
 
     def __str__(self) -> str:
         return self.name.lower()
@@ -34,12 +35,14 @@ STATE_WORDS: dict[SolveState, str] = {
     SolveState.SOLVED: "solved from the pictures",
     SolveState.CARRIED: "hidden: interpolated from neighbouring frames",
     SolveState.LOST: "lost: no pose fits the pictures",
+    SolveState.SKIN: "hidden: estimated from facial skin",
 }
 #: RGB of an arch in overlays, by state; the colours also differ in brightness.
 STATE_COLOURS: dict[SolveState, tuple[int, int, int]] = {
     SolveState.SOLVED: (0, 190, 120),
     SolveState.CARRIED: (255, 225, 0),
     SolveState.LOST: (255, 40, 170),
+    SolveState.SKIN: (110, 170, 255),
 }
 
 

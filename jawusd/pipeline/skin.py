@@ -13,7 +13,7 @@ from jawusd.base.arrays import Array, Mask
 from jawusd.base.errors import FormatError
 from jawusd.base.tables import read_table
 from jawusd.evaluator import JawRig
-from jawusd.evaluator.skin import Skin
+from jawusd.evaluator.skin import Skin, load_skin
 from jawusd.fitting.face import columns_at
 from jawusd.fitting.skin import HEAD_ERROR, clock_offset, fit_skin
 from jawusd.formats.arkit import read_blend_shapes
@@ -108,6 +108,23 @@ def _of_tracks(rig: JawRig, tracks: Tracks) -> JawTake:
     d[known], sigma[known] = found.d, np.sqrt(np.einsum("fii->fi", found.covariance))
     seen = known & (tracks.sigma_mm[:, 0] < _LARGEST_SIGMA_MM)
     return JawTake(frames, d, seen, sigma, fps)
+
+
+def load_own_skin(rig: JawRig, path: str | os.PathLike[str]) -> Skin:
+    """Read a map from skin to d that was learned with a rig.
+
+    Raises:
+        FormatError: the file is invalid, or the map belongs to another subject.
+    """
+    skin = load_skin(path)
+    if skin.actor != rig.actor:
+        raise FormatError(
+            f'was learned from the skin of "{skin.actor}", but the rig is of "{rig.actor}"; parameters differ between '
+            "subjects.",
+            path=path,
+            hint="Use that subject's rig, or learn a map with this rig: `jawusd skin-fit`.",
+        )
+    return skin
 
 
 def read_face(

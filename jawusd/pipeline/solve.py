@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, NotRequired, TypedDict, cast
@@ -10,10 +12,11 @@ from typing import TYPE_CHECKING, NotRequired, TypedDict, cast
 import numpy as np
 
 import jawusd
-from jawusd.base.errors import OutputError, RigError, explain_missing_packages, naming_file
+from jawusd.base.errors import OutputError, RigError, TrackingError, explain_missing_packages, naming_file
 from jawusd.evaluator import JawRig
 from jawusd.evaluator.verdicts import is_inside
 from jawusd.formats.capture import Capture
+from jawusd.formats.finding import Finding
 from jawusd.formats.performance import Performance, SolveState, write_performance
 from jawusd.formats.tracks import save_tracks
 from jawusd.pipeline.calibrate import sync_cameras
@@ -22,13 +25,13 @@ from jawusd.pipeline.capture_inputs import open_capture
 from jawusd.pipeline.pictures import VIDEO, write_overlay
 from jawusd.pipeline.segment_guide import combine_guide
 from jawusd.pipeline.solve_report import check_page, solve_limits, write_solve_report
-from jawusd.pipeline.solve_videos import VideoOptions, solve_videos
+from jawusd.pipeline.solve_videos import SkinOptions, VideoOptions, solve_videos
 from jawusd.pipeline.state import Progress, no_progress
 from jawusd.pipeline.subject import load_labelled, registered_meshes
 from jawusd.pipeline.track import tracking_config
 
 if TYPE_CHECKING:
-    pass
+    from jawusd.pipeline.solve_skin import SkinOfShot
 
 
 SUFFIXES = (".csv", ".npz", ".usdc", ".usda")
@@ -41,16 +44,18 @@ class SolveSummary(TypedDict):
     frames: int
     solved: int
     carried: list[tuple[int, int]]  # runs of frames, as (first, last), in which an arch is occluded
+    skin: list[tuple[int, int]]  # runs of frames, as (first, last), in which d is estimated from facial skin
     lost: list[tuple[int, int]]  # runs of frames, as (first, last), in which no pose fits the images
     within_tolerance: int  # number of frames outside the bound, but within the tolerance of measured poses
     outside: int  # number of frames outside the bound by more than the tolerance
     cameras: list[str]
-    sigma_mm: dict[str, float]  # median standard deviation of d1, d2, d3 over solved frames
+    sigma_mm: dict[str, float]  # median standard deviation of d1, d2, d3 over solved frames, if any
     worst_sigma_mm: dict[str, float]  # maximum standard deviation over all frames
     limits: str  # what limits the accuracy, in words
     focal: NotRequired[
         dict[str, tuple[float, float]]
     ]  # ratio of estimated to calibrated focal length, and its standard deviation, by camera
+    skin_offset_s: NotRequired[float]  # seconds from frame 0 of the shot to that of the face
     findings: NotRequired[list[dict[str, str | float | int]]]
 
 
@@ -67,6 +72,7 @@ def solve(
     free_focal: bool = False,
     jobs: int = 2,
     allow_outside: bool = False,
+    skin: SkinOptions | None = None,
     progress: Progress | None = None,
 ) -> Performance:
     """Solve for head pose and jaw parameters in every frame of a shot; optionally write them to a file.
@@ -84,45 +90,35 @@ def solve(
         free_focal: estimate the focal lengths; those of the calibration may then be wrong by up to 10 %.
         jobs: number of threads; the result does not depend on it.
         allow_outside: allow paths in the capture that point outside its folder.
+        skin: facial skin during the shot, which determines d in frames with hidden teeth. With skin, the shot needs no
+            images.
 
     Raises:
-        FormatError, RigError: the rig cannot be read.
+        FormatError, RigError: the rig, or a file of the skin, cannot be read.
+        FittingError: the skin does not belong to the rig or the shot.
         CaptureError, CalibrationError, SyncError: see `track`.
         TrackingError: the teeth cannot be found in the masks or the videos.
         OutputError: a file cannot be written.
     """
+    from jawusd.pipeline.solve_skin import SkinOfShot
     from jawusd.tracking.performance.results import tracks_of
-    from jawusd.tracking.performance.shot import solve_capture
 
     check_output(rig, out, overlay, report)
     progress = progress or no_progress
     capture = open_capture(shot, allow_outside=allow_outside)
     jaw = jawusd.load(rig, prim=prim)
-    offsets = sync_cameras(capture, progress)["offsets"]
-    with naming_file(capture.folder / "capture.toml"):
-        cameras = load_cameras(capture)
-        meshes, findings = load_labelled(capture)
-        meshes = registered_meshes(meshes, jaw.meta)
-        if any(camera.masks for camera in capture.cameras):
-            solving = partial(progress, "solve")
-            teeth = meshes["upper_teeth"], meshes["lower_teeth"]
-            found = solve_capture(
-                capture,
-                cameras,
-                offsets,
-                *teeth,
-                jaw,
-                tracking_config(capture),
-                fixed_head=fixed_head,
-                free_focal=free_focal,
-                threads=jobs,
-                progress=solving,
-            )
-            findings += combine_guide(capture, tracks_of(found, jaw), jaw.landmarks)[1]
-        else:
-            table = {camera.name: camera for camera in cameras}
-            options = VideoOptions(fixed_head, free_focal, jobs)
-            found = solve_videos(capture, table, offsets, meshes, jaw, options, progress)
+    by_skin = None if skin is None else SkinOfShot(jaw, skin, capture.fps)
+    if skin is not None and by_skin is not None and (skin.only or not _has_images(capture)):
+        if overlay is not None:
+            raise OutputError("needs the pose of the head, which is unknown from skin alone.", path=overlay)
+        offsets: dict[str, int] = {}
+        found, findings = _from_skin(capture, jaw, by_skin)
+    else:
+        offsets = sync_cameras(capture, progress)["offsets"]
+        options = VideoOptions(fixed_head, free_focal, jobs, by_skin)
+        found, findings = _from_images(capture, jaw, offsets, options, progress)
+    if by_skin is not None:
+        found.notes["skin_offset_s"] = by_skin.offset_s
     known = cast("list[dict[str, str | float | int]]", found.notes.get("findings", []))
     found.notes["findings"] = [*known, *(finding.as_json() for finding in findings)]
     if out is not None:
@@ -132,6 +128,67 @@ def solve(
     if report is not None:
         write_solve_report(report, tracks_of(found, jaw), capture, offsets, progress)
     return found
+
+
+def _from_images(
+    capture: Capture, jaw: JawRig, offsets: dict[str, int], options: VideoOptions, progress: Progress
+) -> tuple[Performance, list[Finding]]:
+    """Return the performance by masks or images of the teeth, and findings about the scans."""
+    from jawusd.tracking.performance.results import tracks_of
+    from jawusd.tracking.performance.shot import solve_capture
+
+    with naming_file(capture.folder / "capture.toml"), _naming_skin_only(options):
+        cameras = load_cameras(capture)
+        meshes, findings = load_labelled(capture)
+        meshes = registered_meshes(meshes, jaw.meta)
+        if not any(camera.masks for camera in capture.cameras):
+            table = {camera.name: camera for camera in cameras}
+            return solve_videos(capture, table, offsets, meshes, jaw, options, progress), findings
+        found = solve_capture(
+            capture,
+            cameras,
+            offsets,
+            meshes["upper_teeth"],
+            meshes["lower_teeth"],
+            jaw,
+            tracking_config(capture),
+            fixed_head=options.fixed_head,
+            free_focal=options.free_focal,
+            skin=options.skin,
+            threads=options.jobs,
+            progress=partial(progress, "solve"),
+        )
+        findings += combine_guide(capture, tracks_of(found, jaw), jaw.landmarks)[1]
+    return found, findings
+
+
+@contextmanager
+def _naming_skin_only(options: VideoOptions) -> Iterator[None]:
+    """Add a hint to errors about the teeth, if facial skin is available."""
+    try:
+        yield
+    except TrackingError as error:
+        if options.skin is not None:
+            error.hint = f"{error.hint or ''} If no frame shows the teeth, use --skin-only.".strip()
+        raise
+
+
+def _has_images(capture: Capture) -> bool:
+    """Return whether a camera of a capture has masks or a video."""
+    return any(camera.masks is not None or camera.video is not None for camera in capture.cameras)
+
+
+def _from_skin(capture: Capture, jaw: JawRig, skin: SkinOfShot) -> tuple[Performance, list[Finding]]:
+    """Return the performance by facial skin alone, and findings about the scans."""
+    from jawusd.tracking.contour.scan import prepare_scan
+    from jawusd.tracking.performance.skin_alone import solve_by_skin
+
+    with naming_file(capture.folder / "capture.toml"):
+        meshes, findings = load_labelled(capture)
+        meshes = registered_meshes(meshes, jaw.meta)
+    scans = prepare_scan(meshes["upper_teeth"], "upper"), prepare_scan(meshes["lower_teeth"], "lower")
+    frames = range(*capture.frames) if capture.frames else skin.frames()
+    return solve_by_skin(jaw, scans, skin, frames, capture.fps), findings
 
 
 @explain_missing_packages()
@@ -160,11 +217,14 @@ def write_solved(
         from jawusd.rig import write_animation
         from jawusd.rig.rebake import write_over
 
-        unseen = performance.frames[performance.state != SolveState.SOLVED]
+        state = performance.state
+        unseen = performance.frames[(state == SolveState.CARRIED) | (state == SolveState.LOST)]
+        by_skin = performance.frames[state == SolveState.SKIN]
         if prim is not None:
-            write_over(out, rig, jaw, performance.frames, performance.d, fps, prim, unseen)
+            write_over(out, rig, jaw, performance.frames, performance.d, fps, prim, unseen, by_skin)
         else:
-            write_animation(out, rig, performance.frames, performance.d, fps, rig=jaw, carried=unseen)
+            frames, d = performance.frames, performance.d
+            write_animation(out, rig, frames, d, fps, rig=jaw, carried=unseen, by_skin=by_skin)
 
 
 def check_output(
@@ -197,12 +257,13 @@ def solve_summary(performance: Performance) -> SolveSummary:
     p = performance
     solved = p.state == SolveState.SOLVED
     sigma = p.sigma_d
-    typical = np.median(sigma[solved], axis=0) if solved.any() else np.full(3, np.nan)
+    typical = np.median(sigma[solved] if solved.any() else sigma, axis=0)
     names = ("d1", "d2", "d3")
     summary = SolveSummary(
         frames=len(p.frames),
         solved=int(solved.sum()),
         carried=_runs(p, SolveState.CARRIED),
+        skin=_runs(p, SolveState.SKIN),
         lost=_runs(p, SolveState.LOST),
         within_tolerance=int((p.valid & ~is_inside(p.margin_mm)).sum()),
         outside=int((~p.valid).sum()),
@@ -214,6 +275,8 @@ def solve_summary(performance: Performance) -> SolveSummary:
     )
     if "focal" in p.notes:
         summary["focal"] = cast("dict[str, tuple[float, float]]", p.notes["focal"])
+    if "skin_offset_s" in p.notes:
+        summary["skin_offset_s"] = cast(float, p.notes["skin_offset_s"])
     return summary
 
 

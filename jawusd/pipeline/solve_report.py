@@ -96,7 +96,9 @@ def _write(
     progress("report", 0, 2)
     left_out: list[str] = []
     overlays: tuple[Overlay, ...] | None = None
-    if capture is None:
+    if not tracks.camera_names:
+        left_out.append("images: the pose of the head is unknown, since d is from skin alone.")
+    elif capture is None:
         left_out.append("images and cameras: no shot was given (--capture).")
     else:
         shot = capture
@@ -148,6 +150,7 @@ def frames_to_show(tracks: Tracks, fps: float) -> list[tuple[int, str]]:
     for has, badness, most, words in (
         (solved.state == SolveState.LOST, sigma, _MOST_UNSEEN, "lost, expected error up to {:.2f} mm"),
         (solved.state == SolveState.CARRIED, sigma, _MOST_UNSEEN, "occluded, expected error up to {:.2f} mm"),
+        (solved.state == SolveState.SKIN, sigma, _MOST_UNSEEN, "estimated from skin, expected error up to {:.2f} mm"),
         (~solved.valid, -solved.margin_mm, _MOST_OUTSIDE, "{:.2f} mm outside the rig's bound, more than its tolerance"),
         (seen, sigma, _MOST_UNCERTAIN, "solved, with one of the largest expected errors, {:.2f} mm"),
     ):
@@ -163,6 +166,8 @@ def frames_to_show(tracks: Tracks, fps: float) -> list[tuple[int, str]]:
 
 def solve_limits(cameras: Sequence[str]) -> str:
     """Return a phrase that names what limits the accuracy of a solve from these cameras."""
+    if not cameras:
+        return "the skin: it does not follow the bone exactly"
     if len(cameras) == 1:
         return "a single camera: errors are largest along its line of sight"
     return "the rig: its error at the condyles exceeds that of the outlines"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -23,16 +24,41 @@ from jawusd.pipeline.subject import subject_of_capture
 if TYPE_CHECKING:
     from jawusd.tracking.config import Mapper
     from jawusd.tracking.performance.coordinates import Pose
+    from jawusd.tracking.performance.skin import SkinOf
     from jawusd.tracking.region.appearance import Cut
 
 
 @dataclass(frozen=True)
 class VideoOptions:
-    """Options of `solve` for shots without masks."""
+    """Options of `solve` for shots with images; see `tracking.performance.shot.solve_capture`."""
 
     fixed_head: bool = False
     free_focal: bool = False
     jobs: int = 2
+    skin: SkinOf | None = None
+
+
+@dataclass(frozen=True)
+class SkinOptions:
+    """Input of `solve` about facial skin.
+
+    Attributes:
+        skin: the map from skin to d, written by `jawusd skin-fit`.
+        face: facial motion during the shot; it has the columns from which the map was learned.
+        fps: frame rate of the face [1/s], if the file does not state it.
+        offset_s: seconds from frame 0 of the shot to that of the face; None: estimated.
+        unit, rigid, rest_frame: see `pipeline.skin.read_face`.
+        only: whether to ignore the images of the shot.
+    """
+
+    skin: str | os.PathLike[str]
+    face: str | os.PathLike[str]
+    fps: float | None = None
+    offset_s: float | None = None
+    unit: str = "mm"
+    rigid: Mapping[str, str] | None = None
+    rest_frame: int | None = None
+    only: bool = False
 
 
 class PreparedTeeth:
@@ -97,6 +123,7 @@ class VideoShot:
             fps=capture.fps,
             fixed_head=options.fixed_head,
             free_focal=options.free_focal,
+            skin=options.skin,
         )
         self._frames = shot.frames
         self.take = PictureTake(jaw, teeth.scans, teeth.axes, shot)
@@ -163,6 +190,3 @@ def solve_videos(
     found.notes["start"] = {"by": begin.by, "frame": begin.frame, "fit": begin.fit}
     found.notes["findings"] = [finding.as_json() for finding in teeth.search.findings]
     return found
-
-
-#: Suffixes of the files that a performance can be written to.

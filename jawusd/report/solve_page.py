@@ -23,16 +23,16 @@ from jawusd.formats.performance import STATE_WORDS, SolvedJaw, SolveState
 from jawusd.formats.report import SolveReportData
 from jawusd.formats.tracks import LOST, Tracks
 from jawusd.report.figures import larger_magnitude, legend_beside, runs, thinned
-from jawusd.report.style import BLACK, BLUE, GREEN, GREY, MAGENTA, ORANGE, VERMILION, inline_svg, new_figure
+from jawusd.report.style import BLACK, BLUE, GREEN, GREY, MAGENTA, ORANGE, SKY, VERMILION, inline_svg, new_figure
 from jawusd.report.templates import package_file, page_environment
 
 #: Colours of the solve states: close to those of the outlines in the images, but legible on light and dark pages.
-STATE_INKS = {SolveState.SOLVED: GREEN, SolveState.CARRIED: ORANGE, SolveState.LOST: MAGENTA}
+STATE_INKS = {SolveState.SOLVED: GREEN, SolveState.SKIN: SKY, SolveState.CARRIED: ORANGE, SolveState.LOST: MAGENTA}
 _NAMES = ("d1 opening", "d2 laterotrusion,\nleft is positive", "d3 protrusion,\nforward is positive")
 _INKS = (BLACK, BLUE, VERMILION)
 _STYLES = ("-", "--", ":")
 _BAND = 2.0  # half width of the error band [sigma]; it contains 95 % of normally distributed errors
-_UNOBSERVED = (SolveState.CARRIED, SolveState.LOST)
+_UNOBSERVED = (SolveState.SKIN, SolveState.CARRIED, SolveState.LOST)
 _LISTED = 60  # maximum number of runs in the table
 
 
@@ -57,7 +57,7 @@ def jaw_figure(tracks: Tracks, solved: SolvedJaw, fps: float) -> Figure:
         legend_beside(axis)
     _label_frames(axes[0], axes[-1], fps)
     shades = [Patch(color=STATE_INKS[state], alpha=0.3, label=STATE_WORDS[state]) for state in _UNOBSERVED]
-    figure.legend(handles=shades, loc="outside upper right", ncols=2, frameon=False)
+    figure.legend(handles=shades, loc="outside upper right", ncols=3, frameon=False)
     return figure
 
 
@@ -104,7 +104,7 @@ def _shade(axis: Axes, frames: NDArray[np.int64], solved: SolvedJaw) -> None:
 
 def _name_lanes(axis: Axes, names: list[str]) -> None:
     axis.set_yticks([-lane for lane in range(len(names))], names)
-    axis.set_ylim(0.5 - len(names), 0.5)
+    axis.set_ylim(0.5 - max(len(names), 1), 0.5)
     for lane in range(len(names)):
         axis.axhline(-lane - 0.5, color=GREY, lw=0.4)
 
@@ -204,6 +204,11 @@ def _counts(solved: SolvedJaw) -> list[tuple[str, int, str, str]]:
     rows = (
         ("solved", solved.state == SolveState.SOLVED, "both arches were found in the masks"),
         (
+            "skin",
+            solved.state == SolveState.SKIN,
+            "an arch was not found; d is estimated from facial skin",
+        ),
+        (
             "carried",
             solved.state == SolveState.CARRIED,
             "an arch was hidden; its pose is interpolated",
@@ -229,6 +234,8 @@ def _sentence(solved: SolvedJaw, has_findings: bool) -> str:
     said = []
     if (solved.state == SolveState.LOST).any():
         said.append("some frames are lost: inspect their masks")
+    if (solved.state == SolveState.SKIN).any():
+        said.append("some frames are estimated from facial skin: see their sigma for the expected error")
     if (solved.state == SolveState.CARRIED).any():
         said.append("some frames are interpolated from their neighbours: see their sigma for the expected error")
     if not solved.valid.all():

@@ -35,9 +35,11 @@ _MAX_HALVINGS = 5
 _USD_LERP_BELOW = 1e-5  # threshold of 1 - cosine below which GfSlerp interpolates linearly
 # Maximum number of baked frames, enough for an hour at 60 frames per second, and maximum absolute frame number.
 _MAX_FRAMES, _FARTHEST_FRAME = 220_000, 1e9
-#: Keys in an animation layer's `customLayerData`: frames without d, and frames with d inferred from their neighbours.
+#: Keys in an animation layer's `customLayerData`: frames without d, with d inferred from their neighbours, and with d
+#: estimated from facial skin.
 LOST = "lostFrames"
 CARRIED = "carriedFrames"
+SKIN = "skinFrames"
 
 
 def write_animation(
@@ -49,6 +51,7 @@ def write_animation(
     *,
     rig: JawRig | None = None,
     carried: ArrayLike = (),
+    by_skin: ArrayLike = (),
     skinned: Iterable[str] = (),
 ) -> Path:
     """Write an animation layer that sublayers an actor; time codes are frame numbers.
@@ -62,6 +65,7 @@ def write_animation(
         rig: The evaluator; read from `actor` if None.
         carried: Frames whose d was not measured but interpolated from neighbouring frames; listed in
             `customLayerData["carriedFrames"]`.
+        by_skin: Frames whose d was estimated from facial skin; listed in `customLayerData["skinFrames"]`.
         skinned: Paths of the meshes that are bound by `actor_skel.usdc`, a file in the same folder with the same
             motion. If there are any, a variant is added; see `add_skeleton_variant`.
 
@@ -94,8 +98,7 @@ def write_animation(
     layer = new_layer(fps)
     layer.subLayerPaths.append(relative_path(actor, out))
     layer.startTimeCode, layer.endTimeCode = float(frames[0]), float(frames[-1])
-    if len(np.atleast_1d(carried)):
-        layer.customLayerData = {**layer.customLayerData, CARRIED: _gf.int_array(np.floor(np.asarray(carried)))}
+    note_unseen(layer, carried, by_skin)
     if not known.all():
         lost = _gf.int_array(np.floor(frames[~known]))
         layer.customLayerData = {**layer.customLayerData, LOST: lost}
@@ -103,6 +106,13 @@ def write_animation(
     if paths := list(skinned):
         add_skeleton_variant(layer, rig, paths)
     return write_layer(rename_actor(layer, root_prim_of(actor)), out)
+
+
+def note_unseen(layer: Sdf.Layer, carried: ArrayLike, by_skin: ArrayLike) -> None:
+    """List the frames (F,) whose d was not measured in the layer's `customLayerData`; see `write_animation`."""
+    for key, frames in ((CARRIED, carried), (SKIN, by_skin)):
+        if len(np.atleast_1d(frames)):
+            layer.customLayerData = {**layer.customLayerData, key: _gf.int_array(np.floor(np.asarray(frames)))}
 
 
 def root_prim_of(actor: Path) -> str:

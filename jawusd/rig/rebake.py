@@ -15,8 +15,7 @@ from pxr import Sdf, Usd, UsdGeom, Vt
 from jawusd.base.arrays import Array
 from jawusd.base.errors import FormatError, RigError
 from jawusd.evaluator import JawRig
-from jawusd.rig import _gf
-from jawusd.rig.animation import CARRIED, author_motion
+from jawusd.rig.animation import author_motion, note_unseen
 from jawusd.rig.attributes import key_times
 from jawusd.rig.layers import new_layer, relative_path, write_layer
 from jawusd.rig.layout import MOTION, PARAMETERS, SKELETON, TRANSFORMS, rig_prims
@@ -188,6 +187,7 @@ def write_over(
     fps: float,
     prim_path: str,
     carried: ArrayLike = (),
+    by_skin: ArrayLike = (),
 ) -> Path:
     """Write a motion for one rig in a stage as a layer over the stage, keeping the frame rate of the motion.
 
@@ -197,14 +197,15 @@ def write_over(
         d: Jaw parameters [mm], shape (F, 3); rows with NaN are interpolated.
         fps: Frames per second.
         prim_path: The rig's prim.
-        carried: Frames whose d was inferred; see `write_animation`.
+        carried, by_skin: Frames whose d was inferred; see `write_animation`.
 
     Raises:
         JawusdError: see `write_rebaked`.
     """
     step = float(open_stage(stage).GetTimeCodesPerSecond()) / fps
     known, times = np.isfinite(d).all(axis=1), np.asarray(frames, dtype=np.float64) * step
-    write_rebaked(out, stage, [Rebaked(rig, times[known], d[known], prim_path)], np.asarray(carried) * step, root=True)
+    motion = Rebaked(rig, times[known], d[known], prim_path)
+    write_rebaked(out, stage, [motion], np.asarray(carried) * step, np.asarray(by_skin) * step, root=True)
     return Path(out)
 
 
@@ -222,6 +223,7 @@ def write_rebaked(
     shot: str | os.PathLike[str],
     motions: Sequence[Rebaked],
     carried: ArrayLike = (),
+    by_skin: ArrayLike = (),
     *,
     root: bool = False,
 ) -> list[str]:
@@ -233,7 +235,7 @@ def write_rebaked(
     Args:
         out: File to write.
         motions: The motions, one for each rig to animate.
-        carried: Times whose d was inferred; see `write_animation`.
+        carried, by_skin: Times whose d was inferred; see `write_animation`.
         root: Whether the layer sublayers the stage; if not, it is meant to become a sublayer of the stage.
 
     Returns:
@@ -250,8 +252,7 @@ def write_rebaked(
         raise RigError("the output is a layer over the stage, so it cannot replace the stage.", path=out)
     stage = open_stage(shot)
     layer = _layer_over(stage, np.concatenate([motion.times for motion in motions]))
-    if len(np.atleast_1d(carried)):
-        layer.customLayerData = {**layer.customLayerData, CARRIED: _gf.int_array(np.floor(np.asarray(carried)))}
+    note_unseen(layer, carried, by_skin)
     actors = [_actor(stage, shot, motion.rig, motion.prim) for motion in motions]
     for actor, motion in zip(actors, motions, strict=True):
         _author(layer, actor, motion, shot)

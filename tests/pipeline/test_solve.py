@@ -16,7 +16,7 @@ from jawusd.base.errors import CaptureError, OutputError, RigError, TrackingErro
 from jawusd.formats.performance import SolveState
 from jawusd.formats.poses import read_parameters
 from jawusd.formats.tracks import load_tracks
-from jawusd.geometry import transform_point
+from jawusd.geometry import transform_point, transform_points
 from jawusd.media.video import Video
 from jawusd.pipeline.cameras import load_cameras
 from jawusd.pipeline.capture_inputs import open_capture
@@ -144,12 +144,14 @@ def test_pictures_that_do_not_show_this_person_are_refused(rig):
 @pytest.mark.slow
 def test_frames_that_were_not_seen_are_named(rig, shot, solved, tmp_path):
     found = replace(solved[0], state=solved[0].state.copy())
-    found.state[3] = SolveState.CARRIED
+    found.state[3], found.state[5] = SolveState.CARRIED, SolveState.SKIN
     write_solved(tmp_path / "take.usda", found, jawusd.load(rig), rig, open_capture(shot).fps)
     layer = Sdf.Layer.FindOrOpen(str(tmp_path / "take.usda"))
     frame = int(found.frames[3])
     assert list(layer.customLayerData["carriedFrames"]) == [frame]
-    assert solve_summary(found)["carried"] == [(frame, frame)]
+    assert list(layer.customLayerData["skinFrames"]) == [frame + 2]
+    summary = solve_summary(found)
+    assert summary["carried"] == [(frame, frame)] and summary["skin"] == [(frame + 2, frame + 2)]
 
 
 @pytest.mark.slow
@@ -215,6 +217,42 @@ def test_a_performance_is_drawn_and_reported(rig, shot, tmp_path):
     assert "no shot was given" in again.read_text()
     run("report", files[0], "--capture", shot, "-o", again, "--force")
     assert again.read_text() == page
+
+
+@pytest.mark.slow
+def test_a_shot_is_solved_from_skin_alone(rig, shot, tmp_path):
+    """Points follow three quarters of the bone's motion."""
+    jaw, rng = jawusd.load(rig), np.random.default_rng(0)
+    points = jaw.landmarks[0] + np.array([[0, -30, 5], [12, -28, 0], [-12, -28, 0], [0, -5, 8]])
+
+    def skin_at(T):
+        rest, moved = (transform_points(pose, points) for pose in (jaw.T_rest, T))
+        return rest + 0.75 * (moved - rest) + rng.normal(0, 0.1, (len(T), 4, 3))
+
+    d = jaw.project(rng.uniform(*jaw.d_range.T, size=(300, 3)))
+    names = [f"p{i}" for i in range(4)]
+    jawusd.save_skin(tmp_path / "skin.npz", jawusd.fit_skin(jaw, skin_at(jaw.pose(d)), d, d[:, 0] > 2, names=names))
+    with np.load(EXAMPLE / "truth" / "truth.npz") as truth:
+        frames, T = truth["frames"], truth["T_upper_lower"]
+    table = np.column_stack([frames, skin_at(T).reshape(len(T), -1)])
+    header = ",".join(["frame", *(f"{name}_{axis}" for name in names for axis in "xyz")])
+    np.savetxt(tmp_path / "face.csv", table, "%.6g", ",", header=header, comments="")
+    words = ["solve", rig, shot, "-o", tmp_path / "take.npz", "--skin", tmp_path / "skin.npz", "--face"]
+    words += [tmp_path / "face.csv", "--face-fps", open_capture(shot).fps, "--skin-only"]
+    assert "with --offset" in run(*words, code=7)
+    words += ["--offset", 0]
+    assert "pose of the head" in run(*words, "--overlay", tmp_path / "take.mp4", code=10)
+    said = run(*words, "--report", tmp_path / "take.html")
+    assert "estimated from facial skin: " in said and "with no camera" in said
+    tracks = load_tracks(tmp_path / "take.npz")
+    assert (tracks.solved.state == SolveState.SKIN).sum() >= COUNT - 2 and len(tracks.frames) == COUNT
+    errors = tip_errors_mm(jaw, tracks.frames, tracks.solved.d)
+    assert errors.mean() < 0.6 and errors.max() < 4 * tracks.sigma_mm[:, 0].max()
+    page = (tmp_path / "take.html").read_text()
+    assert "d is estimated from facial skin" in page and "d is from skin alone" in page
+    run("report", tmp_path / "take.npz", "--capture", shot, "-o", tmp_path / "again.html")
+    missing = run("solve", rig, shot, "-o", tmp_path / "x.csv", "--skin", tmp_path / "skin.npz", code=2)
+    assert "--face" in missing and not (tmp_path / "x.csv").exists()
 
 
 def test_files_with_other_names_are_refused_before_any_work(rig, shot, tmp_path):

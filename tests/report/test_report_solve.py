@@ -70,7 +70,7 @@ def test_the_page_asks_for_nothing_and_draws_the_values():
         assert "[mm]" in axis.get_ylabel()
     figure = observation_figure(data.tracks, data.tracks.solved, FPS)
     names = [label.get_text() for label in figure.axes[0].get_yticklabels()]
-    assert names == ["solved  54", "carried  5", "lost  1", "within tolerance  1", "outside  2"]
+    assert names == ["solved  54", "skin  0", "carried  5", "lost  1", "within tolerance  1", "outside  2"]
 
 
 def test_tracks_that_no_solve_made_are_refused():

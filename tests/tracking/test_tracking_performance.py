@@ -12,6 +12,7 @@ from example_model import LANDMARKS_ANATOMICAL, example_arrays, example_meta
 
 from jawusd.base.errors import TrackingError
 from jawusd.evaluator import JawRig
+from jawusd.evaluator.skin import SkinJaw
 from jawusd.formats.performance import SolveState
 from jawusd.geometry import relative_pose, transform_point, transform_points
 from jawusd.tracking.config import TrackingConfig
@@ -57,14 +58,14 @@ def folder(jaw, truth, tmp_path_factory):
     return write_masks(tmp_path_factory.mktemp("shot"), jaw, truth, small_take.CAMERAS)
 
 
-def write_masks(out, jaw, truth, cameras, grown_px=(0.0, 0.0)):
+def write_masks(out, jaw, truth, cameras, grown_px=(0.0, 0.0), hidden=HIDDEN):
     """Write the masks of the take, whose outlines lie `grown_px` outside of the upper and lower teeth."""
     rng = np.random.default_rng(0)
     for camera in cameras:
         for row in small_take.ROWS:
             (out / camera.name / row).mkdir(parents=True)
         for k, (d, head) in enumerate(zip(*truth)):
-            if k in HIDDEN:
+            if k in hidden:
                 continue
             shown = small_take.MESHES, np.stack([head, head @ jaw.pose(d)]), camera, None, 0.3, rng
             masks = {grown: render_masks(*shown, grown_px=grown) for grown in sorted(set(grown_px))}
@@ -163,6 +164,30 @@ def test_a_wrong_mask_in_one_of_three_cameras_costs_no_frame(jaw, scans, truth, 
     assert found.state[k] == SolveState.SOLVED and tip_error_mm(jaw, found, truth)[k] < 0.1
     unused = np.argwhere(~found.use[seen()])
     np.testing.assert_array_equal(unused, [[np.flatnonzero(seen() == k)[0], 1, 1]])
+
+
+def test_skin_measures_the_jaw_while_one_camera_sees_no_teeth(jaw, scans, truth, tmp_path):
+    """Skin with an unknown offset, and two frames with a strange face; half of the frames show no teeth."""
+    hidden, strange = np.arange(6, 20), np.array([11, 12])
+    write_masks(tmp_path, jaw, truth, small_take.CAMERAS[:1], hidden)
+    measured = truth[0] + [0.5, -0.2, 0.2] + np.random.default_rng(6).normal(0, 0.2, (COUNT, 3))
+    measured[strange] += 30.0
+    familiar = ~np.isin(np.arange(COUNT), strange)
+
+    def skin(frames, d, seen):
+        assert len(frames) == len(d) == COUNT and frames[0] == small_take.FIRST
+        np.testing.assert_array_equal(np.flatnonzero(~seen), hidden)
+        return SkinJaw(measured, np.tile(0.2 * np.eye(3), (COUNT, 1, 1)), familiar)
+
+    carried, found = (solved(jaw, scans, truth, tmp_path, small_take.CAMERAS[:1], skin=s) for s in (None, skin))
+    without, errors = (tip_error_mm(jaw, one, truth)[hidden].mean() for one in (carried, found))
+    assert errors < 0.35 < 1.0 < without
+    z2 = ((found.d - truth[0]) ** 2 / found.sigma_d**2)[hidden].mean()
+    assert 0.1 < z2 < 2.0 and (found.sigma_d[hidden] < 0.6 * carried.sigma_d[hidden]).all()
+    assert (found.state[np.setdiff1d(hidden, strange)] == SolveState.SKIN).all()
+    assert (found.state[strange] == SolveState.CARRIED).all()
+    assert (carried.state[hidden] == SolveState.CARRIED).all()
+    assert (np.delete(found.state, hidden) == SolveState.SOLVED).all()
 
 
 @pytest.mark.parametrize("cameras", [1, 3])

@@ -44,7 +44,8 @@ def performance_of(
     verdicts = jaw.validate_parameters(d, tolerance_mm=None)
     found = np.stack([fit.found for fit in fits])
     missed = np.stack([fit.missed for fit in fits]).any(1)
-    state = np.where(found.all(1), SolveState.SOLVED, np.where(missed, SolveState.LOST, SolveState.CARRIED))
+    unseen = np.where(missed, SolveState.LOST, SolveState.CARRIED)
+    state = np.where(found.all(1), SolveState.SOLVED, np.where(smoothed.by_skin, SolveState.SKIN, unseen))
     nothing = np.full(2, np.nan)
     notes: dict[str, object] = {"fps": fps, "habits": smoothed.state.habits.tolist()}
     if free_focal:

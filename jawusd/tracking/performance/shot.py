@@ -28,6 +28,7 @@ from jawusd.tracking.performance.forward import ForwardPass
 from jawusd.tracking.performance.instant import InstantSolver, quick, whole
 from jawusd.tracking.performance.results import performance_of
 from jawusd.tracking.performance.single_start import SingleStart
+from jawusd.tracking.performance.skin import SkinOf, jaw_of_skin
 from jawusd.tracking.performance.smoother import Smoothed, Smoother
 from jawusd.tracking.performance.views import KeptViews, Views
 
@@ -46,6 +47,7 @@ class Shot:
         fps: frames per second.
         fixed_head: whether the cameras are head-mounted, so that the head pose is constant.
         free_focal: whether to estimate the focal lengths.
+        skin: the jaw by facial skin, if known.
     """
 
     views: Views
@@ -56,6 +58,7 @@ class Shot:
     fps: float
     fixed_head: bool = False
     free_focal: bool = False
+    skin: SkinOf | None = None
 
 
 def solve_performance(
@@ -145,6 +148,7 @@ class _Take:
     def second_pass(self) -> Smoothed:
         """Refine all frames jointly."""
         frames = sorted(self.fits)
+        fits = [self.fits[frame] for frame in frames]
         shot, cameras = self._shot, len(self._shot.camera_names)
         smoother = Smoother(
             self._full,
@@ -154,8 +158,9 @@ class _Take:
             cameras,
             fixed_head=shot.fixed_head,
             free_focal=shot.free_focal,
+            skin=jaw_of_skin(shot.skin, frames, fits),
         )
-        return smoother.run([self.fits[frame] for frame in frames])
+        return smoother.run(fits)
 
 
 def solve_capture(
@@ -169,6 +174,7 @@ def solve_capture(
     *,
     fixed_head: bool = False,
     free_focal: bool = False,
+    skin: SkinOf | None = None,
     threads: int = 2,
     progress: Callable[[int, int], None] | None = None,
 ) -> Performance:
@@ -183,6 +189,7 @@ def solve_capture(
         config: settings of the tracker.
         fixed_head: whether the cameras are head-mounted, so that the head pose is constant.
         free_focal: whether to estimate the focal lengths, starting from the calibrated ones.
+        skin: the jaw by facial skin, if known.
         threads: number of threads of the start search; the result does not depend on it.
         progress: called after each frame with the number of frames done and the total.
 
@@ -207,6 +214,7 @@ def solve_capture(
             fps=capture.fps,
             fixed_head=fixed_head,
             free_focal=free_focal,
+            skin=skin,
         )
         found = solve_performance(jaw, scans, shot, config, progress=progress)
         found.notes["findings"] = [finding.as_json() for finding in (*start.findings, *masks.findings())]

@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from jawusd.base.arrays import Array
+from jawusd.base.arrays import Array, Mask
+from jawusd.evaluator.skin import SkinJaw
 from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.contour.annotator import AnnotatorPrior, drawn_prior
 from jawusd.tracking.contour.quality import correlation_px, residual_px
@@ -17,6 +18,7 @@ from jawusd.tracking.performance.attempts import LARGEST_SIGMA, Attempts, FrameF
 from jawusd.tracking.performance.coordinates import HEAD, JAW, LOCAL, Coordinates
 from jawusd.tracking.performance.instant import InstantSolver
 from jawusd.tracking.performance.motion import Motion, head_bends, measured_motion
+from jawusd.tracking.performance.skin import SLOW, SkinFactor
 from jawusd.tracking.performance.system import TakeSystem
 from jawusd.tracking.performance.unknowns import TakeState, Unknowns
 from jawusd.tracking.performance.views import Views, growth_of
@@ -40,6 +42,7 @@ class Smoothed:
     covariance: Array
     state: TakeState
     sigma_log_focal: Array  # standard deviations of the log focal lengths, shape (C,)
+    by_skin: Mask  # frames in which skin contributed to d, shape (F,)
 
 
 class Smoother:
@@ -58,6 +61,7 @@ class Smoother:
         length_px: float | None = None,
         annotator: AnnotatorPrior | None = None,
         wider: float = WIDER,
+        skin: SkinJaw | None = None,
     ) -> None:
         """Configure the refinement.
 
@@ -73,8 +77,9 @@ class Smoother:
             length_px: correlation length of outline errors; default: estimated from the residuals.
             annotator: prior on annotator bias; default: of hand-drawn masks.
             wider: ratio of the true to the computed variance of a frame's unknowns.
+            skin: jaw of the skin in every frame, if known.
         """
-        self._wider = wider
+        self._wider, self._skin = wider, None if skin is None else SkinFactor(skin, fps, wider)
         self._cameras, self._rounds, self._length_px = cameras, _FOCAL_ROUNDS if free_focal else _ROUNDS, length_px
         if views is None:
             self._rounds = 0
@@ -97,19 +102,23 @@ class Smoother:
             done: called with the number of frames matched and the total number of frames.
         """
         config, fits = self._instants.config, list(fits)
-        state = self._unknowns.start()
+        state, slow = self._unknowns.start(), np.zeros((len(fits), SLOW))
         weight = 1.0 / outline_variance(fits, config, self._length_px)
         good = np.array([fit.found.all() for fit in fits])
         motion = measured_motion(self._coordinates, [fit.pose for fit in fits], good, self._fps)
         total = self._rounds * len(fits)
+        if self._skin is not None:
+            fits = self._skin.started(fits)
         if self._unknowns.fixed_head and self._views is not None:
             fits = with_one_head(self._coordinates, fits)
             fits = [self._matched(fit, frame, state) for fit, frame in zip(fits, self._frames, strict=True)]
         if self._unknowns.free_focal and self._views is not None:
             fits = [self._matched(fit, frame, state) for fit, frame in zip(fits, self._frames, strict=True)]
         for round_ in range(self._rounds + 1):
-            system = self._system(fits, state, weight, motion)
-            poses, state = self._unknowns.moved([fit.pose for fit in fits], state, *system.solve())
+            local, shared = self._system(fits, state, weight, motion, slow).solve()
+            own, more = np.split(local, [self._unknowns.local], axis=1)
+            poses, state = self._unknowns.moved([fit.pose for fit in fits], state, own, shared)
+            slow = slow + more if self._skin is not None else slow
             fits = [replace(fit, pose=pose) for fit, pose in zip(fits, poses, strict=True)]
             if round_ == self._rounds:
                 break
@@ -121,17 +130,28 @@ class Smoother:
             weight = 1.0 / outline_variance(fits, config, self._length_px)
         sigma = np.zeros(self._cameras)
         # The bound of the rig is omitted: it is an inequality, and would make the covariance too small.
-        covariance, shared = self._covariance(self._system(fits, state, weight, motion, bounded=False))
+        covariance, shared = self._covariance(self._system(fits, state, weight, motion, slow, bounded=False))
         if self._unknowns.free_focal:
             sigma = np.sqrt(self._wider * np.diag(shared)[self._unknowns.focal])
-        return Smoothed(fits, covariance, state, sigma)
+        return Smoothed(fits, covariance, state, sigma, self._by_skin(len(fits)))
+
+    def _by_skin(self, count: int) -> Mask:
+        return np.zeros(count, bool) if self._skin is None else self._skin.used
 
     def _system(
-        self, fits: Sequence[FrameFit], state: TakeState, weight: Array, motion: Motion, *, bounded: bool = True
+        self,
+        fits: Sequence[FrameFit],
+        state: TakeState,
+        weight: Array,
+        motion: Motion,
+        slow: Array,
+        *,
+        bounded: bool = True,
     ) -> TakeSystem:
         """Linearise the equations of the take at its current state, with or without the bound of the rig."""
         unknowns = self._unknowns
-        system = TakeSystem(len(fits), unknowns.local, unknowns.shared)
+        more = 0 if self._skin is None else SLOW
+        system = TakeSystem(len(fits), unknowns.local + more, unknowns.shared)
         weak = np.zeros(unknowns.local + unknowns.shared)
         weak[unknowns.jaw] = LARGEST_SIGMA[JAW] ** -2.0
         if unknowns.head is not None:
@@ -139,15 +159,19 @@ class Smoother:
         for k, fit in enumerate(fits):
             precision, right = unknowns.frame(fit, weight, bounded=bounded)
             # The weak prior regularises unknowns without measurements.
-            system.add_frame(k, precision + np.diag(1e-3 * weak), right)
+            precision, right = _with_more(precision + np.diag(1e-3 * weak), right, unknowns.local, more)
+            system.add_frame(k, precision, right)
         system.add_shared(*unknowns.prior(state))
         # In gaps, first differences are penalised as well, so that the jaw does not drift at constant velocity.
         unseen = np.array([not fit.found.all() for fit in fits])
-        gap = (unseen[1:] | unseen[:-1])[:, None]
+        unknown = unseen & ~self._by_skin(len(fits))
+        gap, jaw_gap = ((one[1:] | one[:-1])[:, None] for one in (unseen, unknown))
         poses = [fit.pose for fit in fits]
         d = np.stack([pose.d for pose in poses])
         system.add_bends(unknowns.jaw, np.diff(d, 2, axis=0), 1.0 / motion.bend[JAW])
-        system.add_steps(unknowns.jaw, np.diff(d, axis=0), gap / motion.step[JAW])
+        system.add_steps(unknowns.jaw, np.diff(d, axis=0), jaw_gap / motion.step[JAW])
+        if self._skin is not None:
+            self._skin.add(system, d, slow, unknowns.jaw.start)
         if unknowns.head is not None:
             bend, step = head_bends(self._coordinates, poses)
             system.add_bends(unknowns.head, bend, 1.0 / motion.bend[HEAD])
@@ -184,6 +208,8 @@ class Smoother:
         The covariances of the frames include the uncertainty of the take's unknowns.
         """
         found, unknowns = system.covariance(), self._unknowns
+        size = unknowns.local
+        found = found._replace(own=found.own[:, :size, :size], response=found.response[:, :size])
         wide = np.sqrt(unknowns.redundancy)
         shared = found.shared * np.outer(wide, wide)
         if not unknowns.fixed_head:
@@ -196,6 +222,14 @@ class Smoother:
         out = response @ (self._wider * shared) @ np.swapaxes(response, 1, 2)
         out[:, JAW, JAW] += self._wider * found.own
         return np.asarray(out, np.float64), found.shared
+
+
+def _with_more(precision: Array, right: Array, local: int, more: int) -> tuple[Array, Array]:
+    """Return equations of a frame and the take with `more` unknowns inserted after those of the frame."""
+    if not more:
+        return precision, right
+    at = np.full(more, local)
+    return np.insert(np.insert(precision, at, 0.0, axis=0), at, 0.0, axis=1), np.insert(right, at, 0.0)
 
 
 def with_one_head(coordinates: Coordinates, fits: Sequence[FrameFit]) -> list[FrameFit]:

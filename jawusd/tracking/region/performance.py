@@ -12,6 +12,7 @@ import numpy as np
 from jawusd.base.arrays import Array
 from jawusd.base.errors import TrackingError
 from jawusd.evaluator import JawRig
+from jawusd.evaluator.skin import SkinJaw
 from jawusd.formats.performance import Performance
 from jawusd.geometry import Camera
 from jawusd.tracking.config import TrackingConfig
@@ -24,6 +25,7 @@ from jawusd.tracking.performance.coordinates import Coordinates, Pose
 from jawusd.tracking.performance.instant import InstantSolver
 from jawusd.tracking.performance.motion import KNOWN, STEADY
 from jawusd.tracking.performance.results import performance_of
+from jawusd.tracking.performance.skin import SkinOf, jaw_of_skin
 from jawusd.tracking.performance.smoother import WIDER, Smoothed, Smoother, with_one_head
 from jawusd.tracking.region.appearance import Cut, LearnedColours
 from jawusd.tracking.region.recovery import both_ways, contradicts, nearest_found, recover, replace_poses
@@ -67,6 +69,7 @@ class PictureShot:
         fps: frames per second.
         fixed_head: whether the cameras are head-mounted, so that the head pose is constant.
         free_focal: whether to estimate the focal lengths.
+        skin: the jaw by facial skin, if known.
     """
 
     cuts: Cuts
@@ -76,6 +79,7 @@ class PictureShot:
     fps: float
     fixed_head: bool = False
     free_focal: bool = False
+    skin: SkinOf | None = None
 
 
 class PictureTake:
@@ -140,7 +144,7 @@ class PictureTake:
         known = dict(zip(shot.frames, self._follow(cameras, (frame, start), shot.frames, head, progress), strict=True))
         recover(known, shot.frames, lambda lost: self._followed_from(lost, cameras, head, known))
         fits = [known[frame] for frame in shot.frames]
-        smoothed = self._smoothed(shot.frames, fits)
+        smoothed = self._smoothed(shot.frames, fits, jaw_of_skin(shot.skin, shot.frames, fits))
         if shot.free_focal:
             log_focal = smoothed.state.log_focal + np.log(factors)
             smoothed = replace(smoothed, state=replace(smoothed.state, log_focal=log_focal))
@@ -221,7 +225,7 @@ class PictureTake:
         for cut in self._shot.cuts(cameras, self._centre(fits[frame].pose), before):
             yield turned.step(cut)
 
-    def _smoothed(self, frames: range, fits: Sequence[FrameFit]) -> Smoothed:
+    def _smoothed(self, frames: range, fits: Sequence[FrameFit], skin: SkinJaw | None = None) -> Smoothed:
         """Refine all frames jointly."""
         shot = self._shot
         smoother = Smoother(
@@ -235,6 +239,7 @@ class PictureTake:
             length_px=_CORRELATION_PX,
             annotator=_BORDERS,
             wider=WIDER * (_ALONE if len(shot.cameras) == 1 else 1.0),
+            skin=skin,
         )
         return smoother.run(fits)
 

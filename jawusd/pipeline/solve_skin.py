@@ -1,0 +1,125 @@
+"""The jaw of a shot by facial skin: read the face, check that it belongs to rig and shot, and align the clocks."""
+
+from __future__ import annotations
+
+import os
+from math import ceil, floor
+
+import numpy as np
+
+from jawusd.base.arrays import Array, Mask
+from jawusd.base.errors import FittingError, FormatError
+from jawusd.evaluator import JawRig
+from jawusd.evaluator.skin import Skin, SkinJaw
+from jawusd.fitting.face import columns_at
+from jawusd.fitting.skin import clock_offset
+from jawusd.formats.face_table import FaceTable
+from jawusd.pipeline.skin import load_own_skin, read_face
+from jawusd.pipeline.solve_videos import SkinOptions
+
+# Minimum number of frames with visible teeth for comparison with the skin; standard deviation that is added to that of
+# the skin [mm], since d of the first pass is not exact either; and maximum mean squared difference of d over the
+# resulting variance. See docs/explanation/constants.md.
+_COMPARED, _FIRST_PASS_MM, _MOST_APART = 20, 0.5, 4.0
+
+
+class SkinOfShot:
+    """The jaw of the frames of a shot by facial skin; a function object for the solver.
+
+    Attributes:
+        offset_s: seconds from frame 0 of the shot to that of the face; None until it is estimated.
+    """
+
+    def __init__(self, rig: JawRig, options: SkinOptions, fps: float) -> None:
+        """Read map and face; `fps` is the frame rate of the shot [1/s].
+
+        Raises:
+            FormatError: a file is invalid, the map belongs to another subject, or the face has other columns than those
+                of the map or no frame rate.
+        """
+        self._skin = load_own_skin(rig, options.skin)
+        face = read_face(options.face, options.fps, options.unit, options.rigid, options.rest_frame)
+        check_columns(self._skin, face, options)
+        if not face.fps:
+            raise FormatError("does not state its frame rate.", path=options.face, hint="Give it with --face-fps.")
+        self._rig, self._fps, self._face = rig, fps, options.face
+        self._face_s, self._columns = face.frames / face.fps, face.X.reshape(len(face.X), -1)
+        self.offset_s = options.offset_s
+
+    def frames(self) -> range:
+        """Return the frames of the shot that the face covers.
+
+        Raises:
+            FittingError: the offset between the clocks is unknown.
+        """
+        first, last = (self._face_s[[0, -1]] + self._known_offset()) * self._fps
+        return range(max(ceil(first), 0), max(floor(last) + 1, 0))
+
+    def __call__(self, frames: Array, d: Array, seen: Mask) -> SkinJaw:
+        """Return the jaw of the skin in some frames.
+
+        Args:
+            frames: frame numbers of the shot, shape (F,).
+            d: jaw parameters [mm], shape (F, 3).
+            seen: frames in which d was measured, shape (F,).
+
+        Raises:
+            FittingError: the offset between the clocks is unknown and cannot be estimated, no frame has a familiar
+                face, or skin and teeth disagree.
+        """
+        times = frames / self._fps
+        if self.offset_s is None and seen.any():
+            self.offset_s = clock_offset(self._face_s, self._skin(self._columns).d, times[seen], d[seen])
+        found = self._skin(columns_at(self._face_s + self._known_offset(), self._columns, times))
+        if not found.familiar.any():
+            raise FittingError(
+                f"{os.fspath(self._face)}: in none of the {len(frames)} frames does the face resemble those from which "
+                "the map was learned.",
+                hint="Check that face and map have the same unit (--length-unit), that points are relative to the same "
+                "head (--rigid), and the offset of the clocks (--offset).",
+            )
+        self._compare(found, d, seen)
+        return found
+
+    def _known_offset(self) -> float:
+        if self.offset_s is None:
+            raise FittingError(
+                "the offset between face and shot is unknown: it can only be estimated if teeth are visible.",
+                hint="Give the seconds from frame 0 of the shot to frame 0 of the face with --offset.",
+            )
+        return self.offset_s
+
+    def _compare(self, found: SkinJaw, d: Array, seen: Mask) -> None:
+        rows = seen & found.familiar
+        if rows.sum() < _COMPARED:
+            return
+        away = found.d[rows] - d[rows]
+        variance = np.einsum("fii->fi", found.covariance)[rows] + _FIRST_PASS_MM**2
+        apart = float((away**2 / variance).mean())
+        if apart > _MOST_APART:
+            raise FittingError(
+                f"{os.fspath(self._face)}: in {int(rows.sum())} frames with visible teeth, d of the skin differs from "
+                f"d of the teeth by {np.sqrt((away**2).mean()):.1f} mm (root mean square), {np.sqrt(apart):.1f} times "
+                f"the expected error; at most {np.sqrt(_MOST_APART):g} times is accepted.",
+                hint="Check that the face is of this shot, the offset of the clocks (--offset), and that the map was "
+                "learned with this rig and the same points.",
+            )
+
+
+def check_columns(skin: Skin, face: FaceTable, options: SkinOptions) -> None:
+    """Check that a face has the columns from which a map was learned.
+
+    Raises:
+        FormatError: number, kind or names of the columns differ.
+    """
+    names = skin.meta.get("names") or list(face.names)
+    count = face.X[:1].size
+    if count == skin.columns and (face.X.ndim == 3) == skin.points and names == list(face.names):
+        return
+    kinds = ["columns", "coordinates of points"]
+    raise FormatError(
+        f"has {count} {kinds[face.X.ndim == 3]}; {os.fspath(options.skin)} was learned from {skin.columns} "
+        f"{kinds[skin.points]}, which must have the same names and order.",
+        path=options.face,
+        hint="Learn the map again from the points of this file with `jawusd skin-fit`.",
+    )

@@ -1,0 +1,108 @@
+"""The factor of facial skin on d, with a slowly varying error that frames with visible teeth reveal.
+
+Skin measures d in each frame as d_skin = d + L u + w, where L L^T is a share of the covariance that the learned map
+states. The slow error u is an Ornstein-Uhlenbeck process with unit variance (Rasmussen and Williams 2006, equation
+B.29), which is a Markov chain at equally spaced frames. The fast error w has the rest of the covariance; it persists
+over several frames, so its variance is enlarged accordingly.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from jawusd.base.arrays import Array, Mask
+from jawusd.evaluator.skin import SkinJaw
+from jawusd.tracking.performance.attempts import FrameFit
+from jawusd.tracking.performance.system import TakeSystem
+
+#: Function that returns the jaw of the skin in some frames. Arguments: frame numbers, shape (F,); d of the first pass
+#: [mm], shape (F, 3); and whether both arches were found in each frame, shape (F,).
+SkinOf = Callable[[Array, Array, Mask], SkinJaw]
+
+SLOW = 3  # number of unknowns per frame: the slow error in units of its standard deviation
+# Fraction of the variance that belongs to the slow error, its time constant [s], and the time over which fast errors
+# persist [s]; see docs/explanation/constants.md.
+_SHARE, _SLOW_S, _FAST_S = 0.7, 1.0, 0.04
+
+
+class SkinFactor:
+    """Normal equations of the skin's measurements of d.
+
+    Attributes:
+        used: frames with a factor, shape (F,): those with a familiar face.
+    """
+
+    def __init__(self, skin: SkinJaw, fps: float, wider: float = 1.0) -> None:
+        """Prepare the factor.
+
+        Args:
+            skin: jaw of the skin in every frame.
+            fps: frames per second.
+            wider: factor on all precisions, if covariances of the system are multiplied by it later.
+        """
+        self.used = skin.familiar & np.isfinite(skin.d).all(axis=-1)
+        self._d, self._wider = skin.d, wider
+        covariance = np.where(self.used[:, None, None], skin.covariance, np.eye(3))
+        self._slope = np.sqrt(_SHARE) * np.linalg.cholesky(covariance)
+        fast = (1 - _SHARE) * max(1.0, _FAST_S * fps)
+        self._precision = wider * np.linalg.inv(fast * covariance)
+        self._keep = float(np.exp(-1.0 / (_SLOW_S * fps)))
+
+    def started(self, fits: Sequence[FrameFit]) -> list[FrameFit]:
+        """Return fits with d of the skin in frames in which an arch was not found."""
+        return [
+            replace(fit, pose=replace(fit.pose, d=d)) if used and not fit.found.all() else fit
+            for fit, d, used in zip(fits, self._d, self.used, strict=True)
+        ]
+
+    def add(self, system: TakeSystem, d: Array, slow: Array, first: int) -> None:
+        """Add the factor to the equations of a take.
+
+        Args:
+            system: equations; the slow error is the last unknowns of each frame.
+            d: current jaw parameters [mm], shape (F, 3).
+            slow: current slow error, shape (F, 3).
+            first: index of the jaw parameters in the unknowns of a frame.
+        """
+        size = system.local + system.shared
+        last = system.local - SLOW
+        rows, prior = np.zeros((3, size)), self._prior()
+        rows[:, first : first + 3] = np.eye(3)
+        for k, weight in enumerate(prior):
+            matrix, right = np.zeros((size, size)), np.zeros(size)
+            own = np.arange(last, system.local)
+            matrix[own, own] = weight
+            right[own] = -weight * slow[k]
+            if self.used[k]:
+                rows[:, own] = self._slope[k]
+                residual = self._d[k] - d[k] - self._slope[k] @ slow[k]
+                matrix += rows.T @ self._precision[k] @ rows
+                right += rows.T @ self._precision[k] @ residual
+            system.add_frame(k, matrix, right)
+        steps = np.diff(slow, axis=0)
+        weight = self._wider * self._keep / (1 - self._keep**2)
+        system.add_steps(slice(last, system.local), steps, np.full(3, weight))
+
+    def _prior(self) -> Array:
+        """Return the precision of each frame's slow error that remains beside the precision of its steps, shape (F,).
+
+        For unit variance and correlation c between neighbours, (x' - c x)^2 / (1 - c^2) is split into
+        c (x' - x)^2 / (1 - c^2) and terms in x^2 and x'^2.
+        """
+        count, keep = len(self._d), self._keep
+        if count == 1:
+            return np.full(1, self._wider)
+        weight = np.full(count, (1 - keep) ** 2 / (1 - keep**2))
+        weight[[0, -1]] = (1 - keep) / (1 - keep**2)
+        return self._wider * weight
+
+
+def jaw_of_skin(skin: SkinOf | None, frames: Sequence[int], fits: Sequence[FrameFit]) -> SkinJaw | None:
+    """Return the jaw of the skin in the frames of a first pass; None without skin."""
+    if skin is None:
+        return None
+    d = np.stack([fit.pose.d for fit in fits])
+    return skin(np.asarray(frames, np.float64), d, np.array([fit.found.all() for fit in fits]))
