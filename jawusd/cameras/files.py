@@ -87,5 +87,5 @@ def calibration_files(path: Path) -> list[Path]:
 
 
 def lacks_sizes(path: Path) -> bool:
-    """Tell whether a calibration's format lacks the image sizes."""
+    """Return whether a calibration's format lacks the image sizes."""
     return _format_of(path).lacks_sizes

@@ -38,8 +38,8 @@ def load_metashape(path: Path) -> list[Camera]:
     """Read the aligned cameras of a Metashape XML, named by their labels, in the file's unit.
 
     Raises:
-        CalibrationError: no camera is aligned, two cameras have the same label, or a sensor is no frame camera or has
-            no calibration.
+        CalibrationError: no camera is aligned, two cameras have the same label, or a sensor is not a frame camera or
+            has no calibration.
         FormatError: the file is damaged.
     """
     root = parsed_xml(path)

@@ -197,7 +197,7 @@ class _Problem:
         return residual.ravel(), np.asarray(derived, np.float64), turned, carried
 
     def _parts(self, x: Array, turns: Array, slopes: Array, c: int) -> list[tuple[Array | int, Array]]:
-        """Return blocks (2n, 6) of one camera's Jacobian; each has a first column, one for all rows or one per row.
+        """Return blocks (2n, 6) of one camera's Jacobian, each with its column offset, common to all rows or per row.
 
         Args:
             turns, slopes: rotations of the boards and their left Jacobians, shape (V, 3, 3).

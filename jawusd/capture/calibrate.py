@@ -28,7 +28,7 @@ from jawusd.geometry import Camera
 #: `reason` in that check explains why the picked points do not determine the scale.
 MeasureScale = Callable[[list[Camera], ScaleCheck], ScaleCheck]
 
-_ENOUGH_VIEWS = 40  # recommended number of views; the shape error is a quarter of the error with 20 views
+_ENOUGH_VIEWS = 40  # recommended number of views; the resulting shape error is a quarter of that with 20 views
 _GOOD_RMS_PX = 0.5
 # Distance between the centre of the mouth and the nearest board corner above which advice is given.
 _FAR_MM = 40.0
@@ -84,7 +84,7 @@ def calibrate_capture(
             few.
 
     Raises:
-            CalibrationError: there are no boards, or the boards do not determine the calibration.
+        CalibrationError: there are no boards, or the boards do not determine the calibration.
         CaptureError: a clip cannot be read.
     """
     if capture.boards is None:

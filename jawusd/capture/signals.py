@@ -2,8 +2,8 @@
 
 The mean brightness of an image falls and rises with the room light. The times of these steps, matched between two
 cameras, give their offset in whole frames. A step during an exposure results in an image of intermediate brightness,
-which gives the fraction of a frame. If the shutter never closes, every step falls into an exposure; otherwise only some
-steps do.
+which gives the time of the step to a fraction of a frame. If the shutter never closes, every step falls into an
+exposure; otherwise only some steps do.
 
 Sounds are matched by generalised cross-correlation (Knapp & Carter 1976) with partial whitening: full whitening (PHAT)
 weights noisy bands as much as the voice, while without whitening hum dominates. The resolution is 1/16000 s, but sound
@@ -31,7 +31,7 @@ _ABRUPT_FRAMES = 3  # maximum duration of a light step [frames]
 _TOLERANCE_FRAMES = 1.0  # maximum time difference of matched light steps [frames]
 _DROPPED_S = 0.5  # maximum offset difference at which unmatched light steps indicate dropped frames
 _FEWEST_STEPS = 2
-_BETWEEN_FRAMES = 0.15  # maximum distance of a step from a frame boundary to be between two exposures
+_BETWEEN_FRAMES = 0.15  # maximum distance from a frame boundary at which a step counts as between two exposures
 RATE_HZ = 16000
 _WHITENING = 0.75
 _LOWEST_HZ = 80.0  # minimum frequency of the sound that is used; excludes mains hum and wind

@@ -31,7 +31,7 @@ _LISTED = 5
 _MOST, _AROUND = 75, 48
 _FEWEST = 12  # minimum number of images from which the usual change is estimated
 _LEAST_CHANGE = 0.1  # minimum change [of 255 levels] that counts as noise or motion
-# Maximum change, relative to the usual change, in a run of repeated images, and in a run of only one or two images;
+# Maximum change, relative to the usual change, in a run of repeated images, and in a run of only one or two images.
 _SAME, _ALIKE = 0.05, 0.03
 # Lengths of runs of repeated images: maximum of a short run, minimum for comparison with noise, minimum at a clip's
 # end.
@@ -134,7 +134,7 @@ def _stands_out(changes: Array, first: int, last: int) -> bool:
     """Return whether changes stop abruptly before a run of repeated images and resume abruptly after it."""
     outside = np.concatenate([changes[max(0, first - _AROUND) : first], changes[last + 1 : last + 1 + _AROUND]])
     if first == 0 or len(outside) < _FEWEST:
-        return False  # many takes begin without motion, so a run at the start is no freeze
+        return False  # many takes begin without motion, so a run at the start does not count as a freeze
     little, usual = np.percentile(outside, (100 - _MOST, _MOST))
     length, most = last - first + 1, changes[first : last + 1].max()
     # If even the most static images change (by noise or motion), the encoder did not cause the repeated images.

@@ -18,7 +18,7 @@ from jawusd.media.pixels import ColourPicture, DecodedPicture
 from jawusd.media.video import Video
 
 _WAIT_S = 0.1
-_KEPT = 8  # number of buffered images; more than ever wait for processing
+_KEPT = 8  # number of buffered images; more images than this never wait for processing
 # Address prefix of local devices, and PyAV's input format for them, by platform.
 _DEVICES = {"linux": ("/dev/", "v4l2"), "darwin": ("avfoundation:", "avfoundation"), "win32": ("video=", "dshow")}
 

@@ -52,7 +52,7 @@ class PngMasks:
         """
         self._pattern, self._size_px, self._labels, self._is_other = pattern, size_px, labels, is_other
         self.odd: dict[int, str] = {}
-        # File names take less memory than paths; hours of several cameras are a hundred thousand files.
+        # File names take less memory than paths; hours of several cameras give a hundred thousand files.
         self._names = self._found(pattern) if "%" in pattern.name else _names(numbered_files(pattern))
         self.count = max(self._names) + 1
 

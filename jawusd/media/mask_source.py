@@ -78,7 +78,7 @@ def _video_of_version(path: Path, changed_ns: int, size: int) -> Video:
 
 
 class _Others:
-    """Files of a take that are not sampled; equal if as many, so that the cache need not compare them."""
+    """Files of a take that are not sampled; equal if equal in number, so that the cache need not compare the files."""
 
     def __init__(self, files: list[Path]) -> None:
         self.files, self._count = files, len(files)

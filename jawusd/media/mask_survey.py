@@ -30,8 +30,8 @@ def survey_masks(source: CameraSource, size_px: tuple[int, int]) -> list[Finding
     the outline is ambiguous; "mask_polarity", a warning that it is ambiguous which level is teeth.
 
     Raises:
-        CaptureError: the masks are missing, damaged, not as large or as many as the camera's images, or not masks; the
-            message names the file and its content.
+        CaptureError: the masks are missing or damaged, differ in size or number from the camera's images, or are not
+            masks; the message names the file and its content.
     """
     if source.masks is None:
         return [
@@ -138,7 +138,7 @@ class MaskSamples:
     counts: tuple[int, int]  # numbers of frames of the upper and the lower mask source
     # First and last frame with a mask, for the upper and the lower arch; None if the arch has no masks.
     first_last: tuple[tuple[int, int] | None, tuple[int, int] | None]
-    read: Callable[[int, int], MaskImage | None]  # returns the mask of an arch (0 upper, 1 lower) in a frame
+    read: Callable[[int, int], MaskImage | None]  # reads the mask of an arch (0 upper, 1 lower) in a frame
 
     @property
     def first_frame(self) -> int | None:

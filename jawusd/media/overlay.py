@@ -66,7 +66,7 @@ def draw_overlay(
 
 
 def arch_colours(tracks: Tracks, row: int) -> tuple[Colour, Colour]:
-    """Return the colours of the upper and lower arch for a row of tracks; by state for a solved performance."""
+    """Return the colours of the upper and lower arch for a row of tracks; in a solve, they show the state."""
     if tracks.solved is None:
         return UPPER_COLOUR, LOWER_COLOUR
     whole = SolveState(int(tracks.solved.state[row]))

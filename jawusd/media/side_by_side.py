@@ -45,7 +45,8 @@ _WIDE_PX = 1200  # width below which each piece of text in a status bar has a li
 _LINE_PX, _LEFT_PX, _GAP_PX, _SWATCH_PX = 26, 10, 34, 14
 _FONT, _SIZE = cv2.FONT_HERSHEY_SIMPLEX, 0.55
 
-Piece = tuple[str, Colour, bool]  # text, its colour, and whether white text follows a swatch of the colour instead
+# Text, colour, and whether a swatch has the colour instead of the text, which is then white.
+Piece = tuple[str, Colour, bool]
 
 
 class CameraWall:

@@ -26,8 +26,8 @@ from jawusd.media.timeline import Timeline
 
 _REENCODE = "Re-encode the video, for example: ffmpeg -i IN -c:v libx264 -crf 12 OUT.mp4."
 _CUT_OFF = "Copy the file again from the camera; repair an interrupted recording first."
-# Decoders, by codec, that read the alpha channel of WebM; it is in a second stream, and a flag in the metadata tells
-# so.
+# Decoders, by codec, that read the alpha channel of WebM; this channel is in a second stream, as a flag in the metadata
+# indicates.
 _ALPHA_DECODERS = {"vp8": "libvpx", "vp9": "libvpx-vp9"}
 # Decoders that report damage with any number of threads. Decoders with error concealment (H.264, MPEG-4) mark an image
 # as damaged only after threads have returned it: with eight threads, a third of the damage in H.264 was missed.
@@ -216,7 +216,7 @@ class Video(Clip):
     def _seek(self, container: av.container.InputContainer, stream: av.VideoStream, index: int) -> None:
         """Seek to the last key frame that is shown no later than an image, or to an earlier key frame.
 
-        Depending on the container, the time that is sought is a presentation or a decoding time. The presentation time
+        Depending on the container, the seek target is a presentation time or a decoding time. The presentation time
         is tried first (a decoding time would lead to one key frame too early in MP4); if this leads past the image, the
         decoding time is used.
         """

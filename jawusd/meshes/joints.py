@@ -28,7 +28,7 @@ _CONDYLE_MM = 10.0  # distance from the condyle landmark that includes the condy
 _REACH_MM = 26.0  # maximum translation of the condylar head, which may move past the articular eminence
 _COARSEST_MM = 4.0  # maximum median edge length of a bone's triangles; a condyle is about 8 mm deep
 _FEWEST_FACES = 30
-# Maximum penetration of a condyle into the skull, and distance from it, in the closed bite.
+# Maximum penetration of a condyle into the skull, and maximum distance from the skull, in the closed bite.
 _DEEPEST_MM, _WIDEST_MM = 2.5, 8.0
 
 

@@ -1,4 +1,4 @@
-"""Rasterise projected triangle meshes on the CPU: silhouettes as bit rows, depth as 1/z.
+"""Rasterise projected triangle meshes on the CPU: silhouettes as bit-packed images, depth as 1/z.
 
 The compiled functions release the GIL and have no state, so threads may call them concurrently. The compiled code is
 cached on disk; argument types are fixed (C-contiguous float32 / int32 / uint64 arrays), so that another dtype raises a

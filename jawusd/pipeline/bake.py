@@ -122,9 +122,9 @@ _WEIGHTS = (0.5, 1.0)  # shape weights in the table; two, because the joint does
 
 
 def joint_deltas(rig: JawRig, mapping: ArkitMapping | None = None) -> list[JointDelta]:
-    """Return the offset of the jaw joint, midway between the condyles, for each shape at half and full weight.
+    """Return the offset of the jaw joint, midway between the condyles, for each ARKit shape at half and full weight.
 
-    All weights of other shapes are zero. d is projected into the bound, as by `jawusd animate`.
+    The weights of all other shapes are zero. The jaw parameters d are projected into the bound, as by `jawusd animate`.
 
     Args:
         mapping: the subject's mapping from ARKit weights to d; None: weights are fractions of the ranges of motion, and

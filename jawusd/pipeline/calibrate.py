@@ -55,7 +55,7 @@ class CalibrationSummary(TypedDict):
 
 
 class SyncResult(TypedDict):
-    """Offset of every camera to the reference camera [frames], with quality figures of the method that found it."""
+    """Offset of every camera from the reference camera [frames], with quality figures of the method that found it."""
 
     offsets: dict[str, Frames]
     method: str
@@ -116,7 +116,7 @@ def _scale_by_masks(
 
 @explain_missing_packages()
 def sync_cameras(capture: Capture, progress: Progress) -> SyncResult:
-    """Return the frame offset of every camera to the reference camera.
+    """Return the frame offset of every camera relative to the reference camera.
 
     Raises:
         SyncError: no flash was found, or the flashes of two cameras do not match.
@@ -139,7 +139,7 @@ def sync_cameras(capture: Capture, progress: Progress) -> SyncResult:
 
 @explain_missing_packages()
 def sync_videos(videos: Mapping[str, Path | ClipSource], reference: str, progress: Progress) -> SyncResult:
-    """Return the frame offset of every clip to the reference clip, as `sync_cameras` does for a capture.
+    """Return the frame offset of every clip relative to the reference clip, as `sync_cameras` does for a capture.
 
     Args:
         videos: clips by the names of their cameras.

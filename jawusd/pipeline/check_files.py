@@ -85,7 +85,7 @@ class Parts:
         return None
 
     def offset_guesses(self) -> list[Mapping[str, int]]:
-        """Return the frame offsets; if unknown, two guesses: zero, and offsets that align the cameras' first masks."""
+        """Return the frame offsets or, if unknown, two guesses: zero, and offsets that align the first masks."""
         if (known := self.offsets()) is not None:
             return [known]
         capture = self.given
@@ -238,7 +238,7 @@ def calibration(parts: Parts) -> Iterator[Finding]:
 
 
 def _rescaled(parts: Parts) -> Iterator[Finding]:
-    """Report calibrations for an image size other than the recorded one; probably a mistake if only some differ."""
+    """Report calibrations whose image size differs from the recorded size; likely a mistake if only some differ."""
     found = rescaled_cameras(parts.given)
     for name, (was, now) in found.items():
         every = len(found) == len(parts.cameras)

@@ -207,9 +207,9 @@ def _pixels(
     source: str,
     camera: str,
 ) -> tuple[Array, Array]:
-    """Return the mask pixels of a source by arch, as if they were a camera's, at a frame of the reference camera.
+    """Return the pixels of the masks of `source`, by arch, at a frame of the reference camera, taken for `camera`.
 
-    `numbered` is 0 if the masks are numbered by the camera's frames, and 1 if they are numbered by the source's frames.
+    `numbered` is 0 if the masks are numbered by the frames of `camera`, and 1 if by the frames of `source`.
     """
     nothing = np.empty((0, 2))
     by = (camera, source)[numbered]

@@ -175,7 +175,7 @@ def camera_names(paths: Sequence[PurePath]) -> dict[PurePath, str]:
 
 
 def pair(names: Mapping[PurePath, str], others: Sequence[PurePath]) -> tuple[dict[PurePath, PurePath], bool]:
-    """Match files, such as masks, to clips; the flag returned is true if matched by name, false if by order.
+    """Match files, such as masks, to clips; the returned flag is true for matches by name, false for matches by order.
 
     Args:
         names: camera names by clip.

@@ -1,4 +1,4 @@
-"""Follow the teeth through footage by colour, from a start frame to both ends, and again where they were lost."""
+"""Follow the teeth through footage by colour, from a start frame to both ends of the take; track lost parts again."""
 
 from __future__ import annotations
 

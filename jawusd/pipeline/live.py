@@ -121,12 +121,12 @@ def live(
 def next_instant(times_s: Sequence[Sequence[float]], after_s: float) -> float | None:
     """Return the time of the next frame to process; None if a source has no image of that frame yet.
 
-    It is the oldest frame that is not too old. A search takes as long as several frames; tracking is faster than real
-    time and catches up afterwards.
+    The oldest frame within `_MOST_BEHIND_S` of the newest one is chosen. A search takes as long as several frames;
+    tracking is faster than real time and catches up afterwards.
 
     Args:
         times_s: increasing times of the buffered images of each source.
-        after_s: time after which the frame must lie [s].
+        after_s: time [s]; only later frames are returned.
     """
     if not all(len(kept) for kept in times_s):
         return None

@@ -87,7 +87,7 @@ class PictureSearch(Generic[T]):
     judged: Callable[[int, T], tuple[T, float]]
 
     def run(self, frames: range, progress: Progress, up_world: Array | None = None) -> Start[T]:
-        """Return the first start with a clear fit, else the best one within a part of the take and an orientation.
+        """Return the first start that fits clearly, or else the best start of a part of the take for one orientation.
 
         `up_world` is the up direction of the head in the world, shape (3,), if known from other frames. If it is given,
         one camera orientation is tried and, with several cameras, the first start that fits is returned, because it
@@ -147,7 +147,8 @@ class PictureSearch(Generic[T]):
 def upright_turns(cameras: Mapping[str, Camera], up_world: Array) -> dict[str, int]:
     """Return the number of counter-clockwise quarter turns that make each camera's image upright.
 
-    `up_world` is the up direction of the head in the world, shape (3,). Cameras that look along it are left out.
+    `up_world` is the up direction of the head in the world, shape (3,). Cameras that look along this
+    direction are left out.
     """
     turns = {}
     for name, camera in cameras.items():

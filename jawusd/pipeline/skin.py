@@ -1,4 +1,4 @@
-"""Learn jaw motion from facial skin: read the face and the jaw of one performance, and align their clocks."""
+"""Learn jaw motion from facial skin: read the face and jaw recordings of one performance, and align their clocks."""
 
 from __future__ import annotations
 
@@ -177,10 +177,11 @@ def learn_skin(
     offset_s: float | None = None,
     head_error: tuple[float, float] = HEAD_ERROR,
 ) -> tuple[Skin, float]:
-    """Learn to estimate d from facial motion, from face and jaw of one performance; both need a frame rate.
+    """Learn to estimate d from facial motion, given recordings of face and jaw in one performance, with frame rates.
 
     Args:
-        offset_s: seconds to add to the face's times to obtain the jaw's times; default: estimated.
+        offset_s: seconds to add to times of the face recording to obtain times of the jaw recording; default:
+            estimated.
         head_error: see `fitting.skin.fit_skin`.
 
     Returns:

@@ -163,7 +163,7 @@ def read_meshes(files: Mapping[str, Path]) -> dict[str, Mesh]:
 
 @explain_missing_packages()
 def read_files(files: Mapping[str, Path]) -> dict[str, Mesh]:
-    """Read mesh files by the names in `MESHES` without labelling; raises CaptureError as `load_meshes`."""
+    """Read mesh files by the names in `MESHES` without labelling; raises CaptureError like `load_meshes`."""
     from jawusd.meshes.meshio import load_mesh
 
     return {name: load_mesh(path, kind="bone" if name in BONES else "scan") for name, path in files.items()}
@@ -214,7 +214,7 @@ class Subject:
     inferred: tuple[str, ...] = ()  # descriptions of quantities that were derived from the meshes, not given
 
     def measured_points(self) -> Array | None:
-        """Return the vertices (V, 3) [mm] at which errors are measured: mandible or, without it, lower teeth."""
+        """Return the vertices (V, 3) [mm] at which errors are measured: the mandible's or else the lower teeth's."""
         for name in ("mandible", "lower_teeth"):
             if name in self.meshes:
                 return self.meshes[name].vertices
@@ -300,7 +300,7 @@ def _measured(
 
 
 def subject_of_landmarks(path: str | os.PathLike[str], name: str) -> Subject:
-    """Return the subject described by a landmarks file (jawusd-landmarks/1); errors are measured at the landmarks.
+    """Return the subject described by a landmarks file (jawusd-landmarks/1); errors are measured at landmarks.
 
     Raises:
         FormatError: see `formats.landmarks.load_landmarks`.

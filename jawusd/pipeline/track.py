@@ -51,7 +51,7 @@ class TrackSummary(TakeNotes):
     without_a_camera: int
     prior_aided: int
     sigma_mm: dict[str, float | None]  # median standard deviation of each landmark's position; None if unknown
-    coverage_error_percent: float | None  # mean part of the used masks that the scans do not cover; None without masks
+    coverage_error_percent: float | None  # mean fraction of the used masks not covered by the scans; None without masks
     frames_used: NotRequired[dict[str, int]]  # number of frames in which a camera was used, by camera
 
 
@@ -177,7 +177,9 @@ def first_pass(
 def model_pass(
     capture: Capture, offsets: dict[str, int], tracks: Tracks, model: JawModel, jobs: int, progress: Progress
 ) -> Tracks:
-    """Track uncertain frames again with the fitted model as a prior; combine poses tracked by colour with it.
+    """Track uncertain frames again with the fitted model as a prior.
+
+    Captures without masks are not tracked again; their poses are combined with the model.
 
     Other parameters and errors are as for `track`.
 
