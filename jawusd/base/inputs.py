@@ -71,9 +71,9 @@ def check_path(path: str | os.PathLike[str], error: type[JawusdError]) -> None:
 
 
 def allow_folders(folders: Iterable[str | os.PathLike[str]]) -> None:
-    """Allow stages to reference files in folders and subfolders, besides those of the environment variable.
+    """Allow stages to reference files in these folders, in addition to those in the environment variable.
 
-    Replaces the folders of earlier calls.
+    Subfolders are included. The folders of earlier calls are replaced.
     """
     _given.set(tuple(Path(folder).resolve() for folder in folders))
 

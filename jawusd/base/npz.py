@@ -43,9 +43,9 @@ def read_npz(path: str | os.PathLike[str], family: str, version: int) -> tuple[N
         version: Newest supported version.
 
     Raises:
-        FormatError: not a file of this family, or a damaged one.
-        VersionError: written by a newer version.
-        UnitsError: other units or twist order.
+        FormatError: the file is not of this family, or is damaged.
+        VersionError: the file was written by a newer version.
+        UnitsError: the file uses other units or another twist order.
     """
     path = Path(path)
     arrays = read_arrays(path)
@@ -66,7 +66,7 @@ def read_arrays(path: str | os.PathLike[str]) -> NamedArrays:
     """Read the arrays of an npz file of any program; nothing is unpickled.
 
     Raises:
-        FormatError: not an npz file, or a damaged one.
+        FormatError: the file is not an npz file, or is damaged.
     """
     path = Path(path)
     check_input(path)
@@ -92,8 +92,8 @@ def check_format(found: object, family: str, version: int, path: str | os.PathLi
     """Check a format label such as ``"jawusd-tracks/1"`` and return its version.
 
     Raises:
-        FormatError: another format, or no label.
-        VersionError: a newer version.
+        FormatError: the label names another format, or is missing.
+        VersionError: the version is newer than supported.
     """
     if found is None:
         raise FormatError(f'states no format; its format must be "{family}/{version}".', path=path)
@@ -127,7 +127,7 @@ def upgraded_model(arrays: NamedArrays, path: object) -> NamedArrays:
     Version 1 stored the tolerance of measured poses as the minimum margin of a valid pose, "margin_limit_mm".
 
     Raises:
-        FormatError: that margin is not a number.
+        FormatError: the minimum margin is not a number.
     """
     known = dict(arrays)
     if "margin_limit_mm" in known:
@@ -144,7 +144,7 @@ def take(arrays: NamedArrays, name: str, shape: tuple[int | None, ...], path: ob
         finite: Reject NaN and infinity.
 
     Raises:
-        FormatError: missing, of another shape, or not finite.
+        FormatError: the array is missing, has another shape, or is not finite.
     """
     if name not in arrays:
         raise FormatError(f'has no array "{name}".', path=str(path))

@@ -44,7 +44,7 @@ def read_text(path: Path, most_bytes: int, encoding: str = "utf-8") -> str:
         encoding: used unless a byte order mark or null bytes indicate UTF-16 or UTF-32.
 
     Raises:
-        FormatError: missing, not a regular file, too large, or not text in this encoding.
+        FormatError: the file is missing, not a regular file, too large, or not text in this encoding.
     """
     check_input(path)
     try:
@@ -121,7 +121,7 @@ def read_table(path: Path, most_bytes: int, comment: str = "#", short_rows: bool
         short_rows: allow rows to end early; the caller checks them with `check_width`.
 
     Raises:
-        FormatError: not text, not a table, or a row with more or fewer cells than the header.
+        FormatError: the file is not text or not a table, or a row has more or fewer cells than the header.
     """
     found, separator = split_rows(read_text(path, most_bytes), path, comment)
     if not found:
@@ -168,7 +168,7 @@ def split_rows(
         blank_rows: keep rows of several blank cells, except at the end.
 
     Raises:
-        FormatError: quotes that do not match.
+        FormatError: quotes do not match.
     """
     named = _NAMED_SEPARATOR.match(text)
     above = 1 if named else 0

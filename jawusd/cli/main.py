@@ -62,7 +62,7 @@ def main() -> None:
     """Run the command line and exit: 0 success, 1 negative result, 2 wrong usage, 3 and above by error family."""
     if (
         "PXR_WORK_THREAD_LIMIT" not in os.environ
-    ):  # read when OpenUSD is loaded; rigs are too small to gain from threads
+    ):  # OpenUSD reads this on loading; rigs are too small to gain from threads
         os.environ |= {"PXR_WORK_THREAD_LIMIT": "1", "TF_ENV_SETTING_ALERTS_ENABLED": "0"}
     # This must be set before numpy is loaded. Multi-threaded sums differ in their last bits between machines, which
     # changes fits by micrometres. The matrices are too small to gain from threads.
@@ -101,7 +101,7 @@ def _unwritable(error: OSError | RuntimeError) -> int:
     """
     if isinstance(error, OSError):
         message = f"{str(error.filename or 'the output'):.200}: {error.strerror or error}."
-    elif str(error).startswith("Symlink loop"):  # Path.resolve raises RuntimeError for these
+    elif str(error).startswith("Symlink loop"):  # Path.resolve raises RuntimeError for circular links
         message = f"{error}."
     else:
         raise error

@@ -184,7 +184,7 @@ def trajectory_options(
     group: str | None,
     rigid: list[str] | None,
 ) -> TrajectoryOptions:
-    """Return the conventions, given by options, of a file of poses or markers.
+    """Return the conventions of a file of poses or markers, as given by the options.
 
     Raises:
         typer.BadParameter: a column map or rigid body is invalid.
@@ -247,7 +247,7 @@ def subject_given(
         name: name of a subject without a capture.
 
     Raises:
-        typer.BadParameter: none or several of these are given.
+        typer.BadParameter: the options describe no subject, or several.
         JawusdError: a file cannot be read.
     """
     from jawusd.pipeline.capture_inputs import open_capture

@@ -53,7 +53,7 @@ def _sync_line(summary: BuildSummary) -> str:
 
 
 def _findings(summary: BuildSummary) -> tuple[list[str], list[str]]:
-    """Return the findings of the check and of tracking as lines; a finding of both is listed with tracking."""
+    """Return the findings of the check and of tracking as lines; findings of both are listed under tracking."""
     tracked = [Finding.from_json(found).line() for found in summary["track"].get("findings", [])]
     checked = [Finding.from_json(found).line() for found in summary.get("findings", [])]
     return [line for line in checked if line not in tracked], tracked

@@ -109,7 +109,7 @@ def scans_lines(summary: ScansSummary) -> list[str]:
 
 
 def start_lines(start: CaptureStart) -> list[str]:
-    """Return what a draft capture has found, and what it lacks, as text."""
+    """Return what was found for a draft capture, and what is missing, as text."""
     folder = start.path.parent
     lines = [f"{start.path}", *(f"  {line}" for line in start.found), *(f"note: {line}." for line in start.notes)]
     if start.missing:

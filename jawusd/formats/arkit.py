@@ -7,9 +7,10 @@ A capture is a CSV table of blend shape weights with time codes:
 
 A time code is HH:MM:SS:FF.fff. FF counts at the rate of the time code, which may differ from the sample rate. Devices
 that record 60 samples per second with a 30 fps time code write a fraction of `.50`, or every time code twice. At 29.97
-and 59.94 frames per second it may skip the first two or four frame numbers of every minute that is not a multiple of
-ten ("drop frame", SMPTE ST 12-1), marked by a semicolon before the frames or by the skipped numbers themselves. Column
-names are case-insensitive; other columns are ignored. In a row whose BlendShapeCount is 0, no face was detected.
+and 59.94 frames per second, time codes may skip the first two or four frame numbers of every minute that is not a
+multiple of ten ("drop frame", SMPTE ST 12-1), marked by a semicolon before the frames or by the skipped numbers
+themselves. Column names are case-insensitive; other columns are ignored. In a row whose BlendShapeCount is 0, no face
+was detected.
 
 The mapping is a JSON file, format jawusd-arkit/1.
 """

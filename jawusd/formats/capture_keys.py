@@ -1,6 +1,6 @@
 """Keys of capture.toml: reference, and validation errors that name table, key, value and allowed values.
 
-Both are derived from the pydantic models that read the file.
+The reference and the errors are derived from the pydantic models that read the file.
 """
 
 from __future__ import annotations

@@ -36,7 +36,7 @@ def load_capture_list(path: str | os.PathLike[str]) -> list[ListedCapture]:
     """Read a list of captures.
 
     Raises:
-        FormatError: missing, not text, empty, a line that cannot be read, or two captures of one name.
+        FormatError: the file is missing, empty or not text, a line is invalid, or two captures have the same name.
     """
     path = Path(path)
     folder, found = path.resolve().parent, []

@@ -142,7 +142,7 @@ def _offer(folder: Path) -> str:
 
 
 def wrong_kind(key: str, path: PurePath) -> str | None:
-    """Return why a key in capture.toml does not accept the type of a file, and accepted types; None if it does.
+    """Return why a key in capture.toml rejects the type of a file, and the accepted types; None if accepted.
 
     Args:
         key: the key, such as `upper_teeth`, `video`, `calibration`.

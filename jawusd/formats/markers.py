@@ -93,7 +93,7 @@ def read_markers(path: str | os.PathLike[str]) -> MarkerTable:
             concatenated in numerical order.
 
     Raises:
-        FormatError: not a marker table, a value that is not a number, tables of different lengths, or a truncated file.
+        FormatError: a file is not a marker table or is truncated, a value is not a number, or tables differ in length.
         CaptureError: no file matches the pattern.
     """
     path = Path(path)

@@ -47,7 +47,7 @@ def read_obj(path: Path) -> MeshData:
     places: list[list[str]] = []
     counts: list[int] = []
     corners: list[str] = []
-    # Per face with negative indices: number of corners, vertices and texture coordinates before it.
+    # Per face with negative indices: numbers of corners, vertices and texture coordinates before the face.
     relative: list[tuple[int, int, int]] = []
     for line in text.replace("\\\n", " ").split("\n"):
         words = (line.partition("#")[0] if "#" in line else line).split()

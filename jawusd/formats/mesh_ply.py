@@ -56,7 +56,7 @@ class _Element:
 
 @dataclass(frozen=True)
 class _Table:
-    """Values of an element: for each scalar property a column (n,); for each list lengths (n,) and joined values."""
+    """Values of an element: per scalar property a column (n,); per list property lengths (n,) and joined values."""
 
     columns: dict[str, Array]
     lists: dict[str, tuple[Indices, Array]]

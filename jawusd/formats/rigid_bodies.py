@@ -37,7 +37,7 @@ def read_body(description: str | os.PathLike[str]) -> RigidBody:
     """Read a rigid body: a marker description file (.rig), or the numbers or names of its markers (`5,6,7,8`).
 
     Raises:
-        FormatError: the text is neither of these, names fewer than three markers, or names a marker twice.
+        FormatError: the text is neither a file nor a list, or the body has fewer than three distinct markers.
     """
     text = os.fspath(description)
     numbers = [piece.strip() for piece in text.split(",")]

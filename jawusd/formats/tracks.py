@@ -81,14 +81,14 @@ class Tracks:
 
     Attributes:
         frames: frame numbers of the reference camera, shape (F,).
-        T_world_upper, T_world_lower, T_upper_lower: final poses, shape (F, 4, 4); the last is T_skull_mandible.
+        T_world_upper, T_world_lower, T_upper_lower: final poses, shape (F, 4, 4); T_upper_lower is T_skull_mandible.
         raw_T_world_upper, raw_T_world_lower, raw_T_upper_lower: first-pass poses, shape (F, 4, 4).
         status: `TrackStatus` of (upper, lower), shape (F, 2).
         prior_aided: whether a frame was recovered with a kinematic prior, (F,). If the metadata has `prior_spread_mm`,
             all final poses used a prior, as in tracking by colour.
         coverage_error: fraction of mask pixels not covered by the projected scan (E_SP of paper eq. 8 over segmented
             pixels), shape (F, 2, C); NaN without a mask.
-        masks_used: which masks were used for the raw poses, shape (F, 2, C); the others are missing or outliers.
+        masks_used: which masks were used for the raw poses, shape (F, 2, C); all other masks are missing or outliers.
         covariance_upper, covariance_lower: covariance of the left twist xi [rad, mm] with T_true = exp(xi) T, world
             frame, about the world origin, shape (F, 6, 6).
         covariance_relative: covariance of T_upper_lower, defined likewise in the skull frame, shape (F, 6, 6).
@@ -96,7 +96,7 @@ class Tracks:
         residual_px: rms distance of matched contour samples at the working size [px], shape (F, 2).
         matched_px: matched contour length at the working size [px], shape (F, 2).
         lost_reason: `LostReason` of the first pass, shape (F, 2); kept if a prior later recovered the pose. Optional in
-            files, like the next two.
+            files, like `lost_value` and `lost_limit`.
         lost_value, lost_limit: the measured value and its limit, in the unit of the reason, shape (F, 2); NaN without
             a reason.
         camera_names: names of the cameras, length C.
@@ -221,7 +221,7 @@ def load_tracks(path: str | os.PathLike[str]) -> Tracks:
         # Lost frames are NaN, so only integer arrays must be finite.
         name: take(arrays, name, shape, path, finite=name in _WHOLE)
         for name, shape in _shapes(count, len(names)).items()
-        if not name.startswith("lost_") or "lost_reason" in arrays  # older files contain none of these three arrays
+        if not name.startswith("lost_") or "lost_reason" in arrays  # older files lack all lost_* arrays
     }
     if not np.isin(values.get("lost_reason", 0), list(LostReason)).all():
         raise FormatError('"lost_reason" has an unknown reason.', path=path)

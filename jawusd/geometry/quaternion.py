@@ -16,7 +16,7 @@ def wxyz_from_matrix(R: ArrayLike) -> Array:
     """Return the unit quaternions (..., 4) with w >= 0 of rotation matrices (..., 3, 3) (Shepperd 1978).
 
     Raises:
-        ValueError: a wrong shape.
+        ValueError: the array has the wrong shape.
     """
     R = np.asarray(R, dtype=np.float64)
     if R.shape[-2:] != (3, 3):
@@ -53,7 +53,7 @@ def _multiples(R: Sequence[Sequence[N]] | Array) -> list[list[N]]:
 def continuous_wxyz(R: ArrayLike) -> Array:
     """Return the unit quaternions (n, 4) of rotations (n, 3, 3), with signs chosen for continuity.
 
-    Slerp takes the shorter arc between two samples, but readers that interpolate the four numbers do not.
+    Slerp takes the shorter arc between two samples, but readers that interpolate the four components do not.
     """
     wxyz = wxyz_from_matrix(R)
     if len(wxyz) > 1:
@@ -66,7 +66,7 @@ def matrix_from_wxyz(q: ArrayLike) -> Array:
     """Return the rotation matrices (..., 3, 3) of quaternions (..., 4), which are normalised first.
 
     Raises:
-        ValueError: a wrong shape.
+        ValueError: the array has the wrong shape.
     """
     unit: Array = np.asarray(q, dtype=np.float64)
     if unit.shape[-1:] != (4,):

@@ -20,7 +20,7 @@ def rigid_fit(source: ArrayLike, target: ArrayLike, weights: ArrayLike | None = 
         weights: non-negative, shape (N,).
 
     Raises:
-        ValueError: wrong shapes, fewer than three points, or collinear points.
+        ValueError: the shapes are wrong, or the points are fewer than three or collinear.
     """
     P, Q = np.asarray(source, dtype=np.float64), np.asarray(target, dtype=np.float64)
     if P.shape != Q.shape[-2:] or P.ndim != 2 or P.shape[1] != 3 or len(P) < 3:
@@ -50,7 +50,7 @@ def rigid_fits(source: ArrayLike, targets: ArrayLike) -> tuple[Array, Array]:
         points or collinear ones.
 
     Raises:
-        ValueError: wrong shapes.
+        ValueError: the shapes are wrong.
     """
     P, Q = np.asarray(source, dtype=np.float64), np.asarray(targets, dtype=np.float64)
     if P.ndim != 2 or P.shape[1] != 3 or Q.ndim != 3 or Q.shape[1:] != P.shape:
@@ -84,7 +84,7 @@ def triangulate(projections: ArrayLike, pixels: ArrayLike) -> Array:
         pixels: undistorted image points [px], shape (C, 2).
 
     Raises:
-        ValueError: wrong shapes or fewer than two views.
+        ValueError: the shapes are wrong, or there are fewer than two views.
     """
     M, x = np.asarray(projections, dtype=np.float64), np.asarray(pixels, dtype=np.float64)
     if M.ndim != 3 or M.shape[1:] != (3, 4) or x.shape != (len(M), 2) or len(M) < 2:

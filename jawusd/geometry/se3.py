@@ -47,7 +47,7 @@ def transform_points(T: ArrayLike, points: ArrayLike) -> Array:
     With points (..., N, 3), one set per transform, the leading axes are broadcast.
 
     Raises:
-        ValueError: a single point; see `transform_point`.
+        ValueError: the argument is a single point; see `transform_point`.
     """
     T, points = np.asarray(T, dtype=np.float64), np.asarray(points, dtype=np.float64)
     if points.ndim < 2:
@@ -117,7 +117,7 @@ def se3_exp(twist: ArrayLike) -> Array:
     """Map twists (omega [rad], v [mm]), shape (..., 6), to rigid transforms (..., 4, 4).
 
     Raises:
-        ValueError: a wrong shape.
+        ValueError: the array has the wrong shape.
     """
     twist = np.asarray(twist, dtype=np.float64)
     if twist.shape[-1:] != (6,):
@@ -130,7 +130,7 @@ def se3_log(T: ArrayLike) -> Array:
     """Map rigid transforms (..., 4, 4) to twists (omega [rad], v [mm]), shape (..., 6), of rotation angle in [0, pi].
 
     Raises:
-        ValueError: a wrong shape.
+        ValueError: the array has the wrong shape.
     """
     T = np.asarray(T, dtype=np.float64)
     if T.shape[-2:] != (4, 4):
