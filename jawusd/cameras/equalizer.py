@@ -3,7 +3,7 @@
 Poses, focal length and film back are read from the `Camera` nodes that "Export Project, Nuke" writes (for a version of
 that export script, see NyanNyanGringo/match-move-exporter on GitHub). The camera axes are x right, y up, z backward.
 `rotate` is in degrees, applied about z first, then x, then y (`rot_order ZXY`). `translate` is in the project's unit,
-mostly cm. `focal`, `haperture` and `vaperture` are in mm. `win_translate` is -2 times the lens centre offset, divided
+usually cm. `focal`, `haperture` and `vaperture` are in mm. `win_translate` is -2 times the lens centre offset, divided
 by the film back size. A parent `Axis` node contains the scene's transform and scale. The optical axis meets the film
 back at its centre plus the lens centre offset (x right, y up). The film back extends to the outer edges of the pixels.
 The image size is not in the file.

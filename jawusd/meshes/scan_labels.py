@@ -1,4 +1,4 @@
-"""Separate crown and gum of a teeth scan by its shape, and by its colours where these differ.
+"""Separate crown and gum of a teeth scan by its shape and, where crown and gum differ in colour, by colour.
 
 There are two kinds of scans. If crowns are separate components of the mesh, each component is crown or gum. If one
 surface covers crowns and gum, the boundary between them is the crease around every crown.
@@ -62,7 +62,7 @@ class Labelling:
 
 
 def label_scan(mesh: Mesh, towards: Array | None) -> Labelling:
-    """Separate crown and gum of a teeth scan by its shape, and by its colours where these differ.
+    """Separate crown and gum of a teeth scan by its shape and, where crown and gum differ in colour, by colour.
 
     A scan that contains only crowns is labelled entirely as crown.
 
