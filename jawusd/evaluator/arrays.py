@@ -125,7 +125,8 @@ class RigArrays:
     @property
     def tolerance_mm(self) -> float:
         """Maximum distance [mm] of a valid measured pose outside the bound; authored poses must lie inside."""
-        return float(self.arrays["tolerance_mm"]) + 0.0  # avoids -0.0 for older files, which store the negated limit
+        # avoids -0.0 for older files, which store the negated tolerance
+        return float(self.arrays["tolerance_mm"]) + 0.0
 
     @property
     def held_out(self) -> HeldOut | None:

@@ -54,7 +54,7 @@ def usable_rows(rows: Array) -> Array:
 
 
 def as_rows(values: ArrayLike, tail: tuple[int, ...], name: str) -> tuple[Array, tuple[int, ...]]:
-    """Return values as rows and the batch shape, as by `rows_of`; see `usable_rows` for rows that become NaN."""
+    """Return values as rows and the batch shape, like `rows_of`; see `usable_rows` for rows that become NaN."""
     rows, batch = rows_of(values, tail, name)
     return usable_rows(rows), batch
 

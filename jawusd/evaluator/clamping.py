@@ -1,4 +1,4 @@
-"""Move motions inside the bound, continuously and at hardly more than their original speed.
+"""Move motions inside the bound, continuously and at little more than their original speed.
 
 Poses outside are moved towards the spine of the bound. Where the resulting path is longer than the original one, it is
 shortened by shortcuts through the interior. The motion then follows the path no faster than the original allows at each
@@ -24,13 +24,15 @@ _MAX_PIECES = 400  # maximum number of samples in one step
 _STEEPEST = 5.0
 _STILL_MM = 1e-12
 _TIME_SHARE = 0.998  # fraction of the available time that a path may take; finer sampling lengthens the path slightly
-# Lines between samples are checked at points `_CHECK_MM` apart, and more finely where the margin is below `_NEAR_MM`.
+# Straight lines between samples are checked at points `_CHECK_MM` apart, and more finely where the margin is below
+# `_NEAR_MM`.
 _CHECK_MM, _NEAR_MM, _MAX_ROUNDS, _ROUNDING_MM = 0.03, 1e-3, 8, 1e-9
 
 _LINE_MM = 0.1  # sample spacing of shortcuts
 _SHORTCUTS = 24  # number of end points tried at once for a shortcut
 _TIGHT_POINTS, _TIGHT_ROUNDS, _TIGHT_GAIN_MM = 49, 20, 0.01
-_TIGHT_SHARES = (1.0, 0.5, 0.25, 0.1)  # fractions of the way to the straight line, in the order tried
+# Fractions of the way to the straight line by which a segment is moved, in the order tried.
+_TIGHT_SHARES = (1.0, 0.5, 0.25, 0.1)
 
 
 class Inside(NamedTuple):
@@ -137,7 +139,7 @@ def _retimed(bound: SliceHull, spine: Spine, path: Array, allowed: Array, ends_s
 
 
 def _thinned(bound: SliceHull, times: Array, d: Array, given: Mask) -> Inside:
-    """Return the original samples, and those others that keep the lines between samples inside the bound."""
+    """Return the original samples, and those added samples that keep the lines between samples inside the bound."""
     keep = given.copy()
     while True:
         kept = np.flatnonzero(keep)
@@ -261,7 +263,7 @@ def _flatten(bound: SliceHull, segment: Array) -> None:
 
 
 def _clear(bound: SliceHull, start: Array, ends: Array) -> Mask:
-    """Return which straight lines from a point (3,) to other points (m, 3) stay inside the bound."""
+    """Return which line segments from a point (3,) to other points (m, 3) stay inside the bound."""
     count = int(np.clip(np.ceil(np.linalg.norm(ends - start, axis=1).max() / _LINE_MM), 2, 400))
     share = np.linspace(0.0, 1.0, count + 1)[1:-1]
     points = start + share[:, None, None] * (ends - start)

@@ -73,7 +73,7 @@ class ContactField:
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, Array], of: Meeting) -> ContactField | None:
-        """Return the clearance field in the named arrays of a rig; None if there is none."""
+        """Return the clearance in the named arrays of a rig; None if the rig has none."""
         name = PREFIXES[of]
         if f"{name}_values" not in arrays:
             return None
@@ -86,7 +86,7 @@ class ContactField:
         )
 
     def arrays(self, of: Meeting) -> dict[str, Array]:
-        """Return the arrays of the clearance field by their names in a rig."""
+        """Return the arrays of the clearance by their names in a rig."""
         named = {
             "first_mm": self.first_mm,
             "step_mm": self.step_mm,
@@ -131,11 +131,11 @@ class ContactField:
         return self.clearance(d).clearance_mm < limit_mm - self.error_mm
 
     def collides_at(self, d: Array, limit_mm: float) -> bool:
-        """Return `collides` for one d (1, 3) [mm], computed in floats, which is faster."""
+        """Return the result of `collides` for one d (1, 3) [mm], computed in Python floats, which is faster."""
         return self._single(*d[0].tolist()) < limit_mm - self.error_mm
 
     def _single(self, d1: float, d2: float, d3: float) -> float:
-        """Return the clearance [mm] at one d [mm], in floats; NaN for NaN."""
+        """Return the clearance [mm] at one d [mm], computed in Python floats; NaN for NaN."""
         if not (math.isfinite(d1) and math.isfinite(d2) and math.isfinite(d3)):
             return math.nan
         flat, (first1, first2, first3), (step1, step2, step3), (last1, last2, last3) = self._floats
@@ -188,7 +188,7 @@ class RigClearance:
 
         Raises:
             EvaluatorError: The rig has no such clearance; see `contact` and `joints`.
-            ValueError: ``of`` is not one of these names.
+            ValueError: ``of`` is neither "teeth" nor "condyles".
         """
         field = self._field(of)
         rows, batch = rows_of(d, (3,), "d")

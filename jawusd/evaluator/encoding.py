@@ -28,8 +28,8 @@ from jawusd.geometry.so3 import hat
 # x (k, 3) -> rotations (k, 3, 3), translations (k, 3), spatial derivatives (k, 6, 3)
 Derivative = Callable[[Array], tuple[Array, Array, Array]]
 
-# Weight of a distance along the sight relative to one across it. It matters only at the bound: elsewhere, two equations
-# across the sight and one along it determine d.
+# Weight of a distance along the line of sight relative to one across it. The weight matters only at the bound:
+# elsewhere, two equations across the sight and one along it determine d.
 _DEPTH_WEIGHT = 0.1
 _MIN_PRECISION = 1e-12  # minimum precision of d in every direction, relative to its trace
 
@@ -239,7 +239,7 @@ class Encoder:
         return found
 
     def _whitened(self, d: Array, measured: Array, W: Array) -> tuple[Array, Array]:
-        """Return ``W xi`` (n, 6) with ``measured = exp(xi) motion(d)``, and its derivative (n, 6, 3) in d."""
+        """Return ``W xi`` (n, 6), ``measured = exp(xi) motion(d)``, and its derivative with respect to d, (n, 6, 3)."""
         R_d, t_d, S = self._model.decode_derivative(d)
         xi = se3_log(measured @ se3_inverse(make_transform(R_d, t_d)))
         # exp(xi(d + e)) = exp(xi) exp(-S e); the right Jacobian is the left Jacobian at -xi

@@ -1,8 +1,8 @@
 """The jaw model's formulas, written once for every number type.
 
 Each function takes numbers with ``+ - * /`` (floats, numpy arrays, torch tensors, values of an ONNX graph) and, where
-a formula needs more, an `Operations` object for that number type. `jawusd.evaluator.kinds` makes models of them. The
-torch layer, the ONNX exporter and the single-file reader are built from those and `BoundFormula`.
+a formula needs more, an `Operations` object for that number type. `jawusd.evaluator.kinds` combines them into models.
+The torch layer, the ONNX exporter and the single-file reader are built from these models and `BoundFormula`.
 `jawusd.evaluator.gauge` is the only other implementation of the gauge, with derivatives.
 
 This file imports only the standard library and modules that do the same: all of them are copied into the single-file
@@ -35,7 +35,8 @@ from jawusd.geometry.rodrigues import N, Triple, apply_series, dot, turning
 ON_BOUND_MM = 1e-6
 FADE_SOFTNESS_MM = 1.0  # rounding of the kink at d1 = 0 in the fading of the glide surface
 LIMIT_SOFTNESS_MM = 4.0  # rounding of the kinks at both path limits
-ARCH_BOW_MM = 10.0  # scale of the quadratic arch terms, d2^2 / 10 mm; gives all coefficients a similar magnitude
+# Length scale of the quadratic terms of rho, d2^2 / 10 mm; gives all coefficients a similar magnitude.
+ARCH_BOW_MM = 10.0
 DROP_BEND = 0.15  # second-order coefficient of the bent drop terms [1/mm]
 DROP_SATURATION_MM2 = 16.0  # squared distance, (4 mm)^2, beyond which the drop terms become straight
 
@@ -90,7 +91,7 @@ def soft_ramp(x: N, softness_mm: float, ops: Operations[N, Table]) -> N:
 
 
 def bent(x: N, ops: Operations[N, Table]) -> N:
-    """Return ``0.15 x^2 / sqrt(1 + x^2 / 16)`` [mm]: a drop that steepens and then continues straight."""
+    """Return ``0.15 x^2 / sqrt(1 + x^2 / 16)`` [mm]: a drop that is quadratic near 0 and linear far from it."""
     square = x * x
     return DROP_BEND * square / ops.sqrt(1.0 + square / DROP_SATURATION_MM2)
 
@@ -170,7 +171,7 @@ class RigidMotion(Generic[N]):
     t: Triple[N]
 
     def carry(self, p: Triple[N]) -> Triple[N]:
-        """Return the image of a point [mm]."""
+        """Return the point [mm] to which the motion moves a point [mm]."""
         return triple([p[i] + dot(self.turn[i], p) + self.t[i] for i in range(3)])
 
 

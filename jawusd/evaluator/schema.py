@@ -70,13 +70,13 @@ JOINT_ARRAYS: dict[str, ArraySpec] = {
     "joint_limit_mm": ArraySpec("jaw:joints:limit"),
 }
 
-#: Arrays of the speeds in a take with a known frame rate, both present or none; see `jawusd.evaluator.speeds`.
+#: Arrays of the speeds in a take with a known frame rate, both present or both absent; see `jawusd.evaluator.speeds`.
 SPEED_ARRAYS: dict[str, ArraySpec] = {
     "velocity_covariance": ArraySpec("jaw:motion:velocityCovariance", (3, 3)),
     "acceleration_covariance": ArraySpec("jaw:motion:accelerationCovariance", (3, 3)),
 }
 
-#: Distances of frames from a bound built without them, both arrays present or none; see
+#: Distances of frames from a bound built without them, both arrays present or both absent; see
 #: `jawusd.evaluator.arrays.HeldOut`.
 HELD_OUT_ARRAYS: dict[str, ArraySpec] = {
     "held_out_share": ArraySpec("jaw:thresholds:heldOutShare"),

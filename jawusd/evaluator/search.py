@@ -37,7 +37,7 @@ class BoundedSearch:
     """Searches inside the bound, started from a cached scan of the valid volume.
 
     Sections at one opening are convex, but the valid volume is not: along d1 the cost may have several local minima
-    ("valleys"), so a search is started at each of the lowest.
+    ("valleys"), so a search is started in each of the lowest valleys.
     """
 
     def __init__(self, model: JawModelForm, bound: SliceHull, kernels: NumpyKernels) -> None:
@@ -53,7 +53,7 @@ class BoundedSearch:
         return _Scan(points, *pairs_in_chunks(self._model.decode, points))
 
     def nearest(self, d: Array) -> Array:
-        """Return the nearest points (n, 3) [mm] inside the bound; d (n, 3) itself where it is inside.
+        """Return the nearest points (n, 3) [mm] inside the bound; points of d (n, 3) that are inside are unchanged.
 
         Raises:
             EvaluatorError: the valid volume is empty.
@@ -113,7 +113,7 @@ class BoundedSearch:
 
     @cached_property
     def _ripples(self) -> Array:
-        """Steps (r, 3) [mm] across ripples of the bound, whose wavelength is the spacing of its knots."""
+        """Steps (r, 3) [mm] across ripples of the bound, whose wavelength is the knot spacing of its supports."""
         spacing_mm = np.diff(self._bound.supports.knots).mean()
         return np.array([[step * spacing_mm, 0.0, 0.0] for step in _RIPPLE_STEPS])
 
@@ -170,7 +170,7 @@ class _Scan:
         return rows, self.points[found[rows, places]]
 
     def _deepest(self, distance: Array) -> Indices:
-        """Return the index of the best point in each of the lowest valleys (n, v) of distances (n, p); -1 if fewer."""
+        """Return the index of the best point in each of the lowest valleys (n, v) of distances (n, p); -1 if none."""
         least = np.minimum.reduceat(distance, self._first, axis=1)
         walls = np.pad(least, ((0, 0), (1, 1)), constant_values=np.inf)
         valley = (least <= walls[:, :-2]) & (least <= walls[:, 2:])

@@ -104,7 +104,7 @@ class Skin:
         self._weights = self._precision @ (self.arrays["d"] - self._d_mean)
 
     def __call__(self, X: ArrayLike) -> SkinJaw:
-        """Return the jaw of faces.
+        """Return the jaw parameters of faces.
 
         Args:
             X: The columns with which the map was learned, shape (..., K), or points [mm], shape (..., N, 3).
@@ -142,7 +142,7 @@ class Skin:
         d = self._d_mean + k @ self._weights
         prior = kernel[1] + kernel[2] * ((f * f).sum(axis=1) + left_out) + kernel[3]
         variance = np.maximum(prior - ((k @ self._precision) * k).sum(axis=1), kernel[3])
-        # change of d [mm] per standard deviation, shape (n, 3, R)
+        # change of d [mm] per standard deviation of each head error, shape (n, 3, R)
         moved = self._gradient(f, smooth) @ self.arrays["head_error"].T
         covariance = variance[:, None, None] * self.arrays["spread"] + moved @ np.swapaxes(moved, 1, 2)
         outside = left_out + (f[:, self._inside :] ** 2).sum(axis=1)

@@ -88,7 +88,7 @@ def minimise(
         if bound is None:
             x[rows] += np.where(
                 moving[:, None], 0.0, step
-            )  # the last step needs no further evaluation and doubles the number of correct digits
+            )  # the last step doubles the number of correct digits, so it needs no further evaluation
         rows = rows[moving]
         r, J, damping, multiplier, step = _picked(moving, r, J, damping, multiplier, step)
         if not rows.size:
@@ -147,7 +147,7 @@ def _damped(A: Array, damping: Array) -> Array:
 
 
 def _first_multiplier(bound: Bound, x: Array, r: Array, J: Array) -> Array:
-    """Return the bound's initial multiplier: from the gradient of the cost where x lies on the bound, otherwise 0."""
+    """Return the bound's initial multiplier: computed from the cost gradient where x lies on the bound, otherwise 0."""
     distance, normal = bound.signed_distance_gradient(x)
     squared = np.maximum(np.einsum("ni,ni->n", normal, normal), MIN_SLOPE)
     press = -np.einsum("ni,ni->n", normal, _gradient(J, r)) / squared

@@ -25,7 +25,7 @@ def compiled(signature: str) -> Callable[[F], F]:
         if not _cacheable or _cacheable[0]:
             try:
                 made = cast("F", _in_memory(signature, cache=True)(function))
-            except (OSError, RuntimeError) as error:  # no writable folder, or the disk is full
+            except (OSError, RuntimeError) as error:  # there is no writable folder, or the disk is full
                 _cacheable[:] = [False]
                 _warn(error)
             else:

@@ -43,7 +43,7 @@ from jawusd.fast.packing import (
 )
 from jawusd.fast.rigid import Vector, device, solve
 
-PARAMETERS, DISPLACEMENT = 0, 1  # charts: x is d, or the incisal displacement u
+PARAMETERS, DISPLACEMENT = 0, 1  # charts: the unknown x is d, or the incisal displacement u
 
 _NOT_FINITE, _NOT_RIGID = Reason.NOT_FINITE.value, Reason.NOT_RIGID.value
 _OFF_MODEL, _OUTSIDE_BOUNDS = Reason.OFF_MODEL.value, Reason.OUTSIDE_BOUNDS.value
@@ -139,7 +139,7 @@ def descend(model: Array, problem: Problem, x: Array, w: Scratch, n: Normal) -> 
         for i in range(3):
             n.trial[i] = x[i] - n.step[i]
         if _settled(n.step) or damping >= MAX_DAMPING:
-            x[:] = n.trial  # the last step needs no further evaluation and doubles the number of correct digits
+            x[:] = n.trial  # the last step doubles the number of correct digits, so it needs no further evaluation
             return
         trial_cost = equations(model, problem, n.trial, w, n.A_trial, n.g_trial)
         if trial_cost <= cost:

@@ -33,7 +33,7 @@ from jawusd.geometry.rodrigues import angle_coefficients, apply_series, cross, d
 
 _ADDITIVE = KINDS.index(ADDITIVE)
 
-# offsets into an anchored model
+# offsets of the fields in a packed anchored model
 SCALES = REST  # lengths dividing the sheared displacement (3,) [mm]
 OFFSET = REST + 3  # value of the spline at u = 0 (3,) [rad]
 LINEAR = REST + 6  # linear terms of the spline (3 inputs, 3 outputs) [rad]
@@ -46,12 +46,12 @@ SPLINE = REST + 41  # centres, column-major (3, m), then kernel weights (m, 3), 
 # layout of the table: numbers of knots n2 and n3, both 0 without a table; knots of d2 (n2,), starts (n2 + 1,), likewise
 # for d3, coefficients (n2 + 1, n3 + 1, 4, 4)
 
-# offsets into an additive model
+# offsets of the fields in a packed additive model
 CURVES = REST  # offsets at which the three curves start, then the curves
 
 
 def parts_of(model: JawModelForm) -> list[ArrayLike]:
-    """Return what a packed model has after `packing.REST`.
+    """Return the part of a packed model that depends on the kind of model, which starts at `packing.REST`.
 
     Raises:
         TypeError: the kind of model has no compiled form.

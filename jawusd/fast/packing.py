@@ -16,7 +16,7 @@ from jawusd.base.arrays import Array
 from jawusd.evaluator.bounds import SliceHull
 from jawusd.evaluator.curves import HermiteCurve
 
-# offsets into a model of any kind
+# offsets of the fields in a packed model of any kind
 KIND = 0  # index into `evaluator.kinds.KINDS`
 COUNT = 1  # number of spline centres; 0 for models without a spline
 # number n of starting points of searches in d; 0 if searches run over the displacement of the incisal point
@@ -31,7 +31,7 @@ ADJOINT = 71  # map (6, 6) of twists from the anatomical to the skull frame
 VECTORS = 107  # vectors (4, 4) that represent the landmarks; see `evaluator.encoding`
 REST = 123  # start of the part that depends on the kind of model
 
-# offsets into the bound
+# offsets of the fields in a packed bound
 ROUNDING = 0  # `SliceHull.softness_mm`
 MARGIN = 1  # `SliceHull.offset_mm`
 SIDES = 2  # number k of half-planes

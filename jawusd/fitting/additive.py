@@ -40,7 +40,7 @@ _PIECES = (8, 6, 6)  # number of polynomial pieces of each of the three curves
 _ROUNDS = 8
 _SMOOTHING = 10.0 ** np.arange(-4.0, 5.0)
 _TAIL_RIDGE = 1e-4  # penalty that keeps coefficients finite in intervals without frames
-_HIDDEN_RIDGE = 1e9  # penalty that keeps the coefficients of parameters that the data do not excite at zero
+_HIDDEN_RIDGE = 1e9  # penalty that keeps coefficients at zero for parameters that the data do not excite
 _TRIM_FLOOR_MM = 0.8  # maximum residual that counts as model error and not as a tracking failure
 _CV_BLOCK, _CV_FOLDS, _CV_CAP_MM = 25, 5, 1.0
 _LARGEST_CONDITION = 1e3
@@ -134,7 +134,7 @@ def fit_additive(data: TrainingData, shown: Mask, trim_mad: float) -> FittedForm
     """Fit the sum of three curves.
 
     Args:
-        shown: which parameters the data excite, shape (3,); the curves of the other parameters are pure translations.
+        shown: mask of the parameters that the data excite, shape (3,); the curves of the others are pure translations.
         trim_mad: see `FittingConfig`.
     """
     u = data.displacement()

@@ -36,7 +36,7 @@ _DEGREE = 4
 _RIDGE = 1e-3
 _RANGE_PERCENTILES = (0.5, 99.5)  # slide percentiles outside which the eminence is extrapolated linearly
 _LANDMARK_SIGMA_MM = 10.0  # prior standard deviation of the kinematic centre about the landmark
-_PATH_SIGMA_MM = 0.3  # standard deviation of the kinematic centre from its path
+_PATH_SIGMA_MM = 0.3  # standard deviation of the distance of the kinematic centre from its path
 _FRAMES_ALIKE = 25  # number of consecutive frames (one second) that count as one independent observation
 _NEWTON_STEPS, _LARGEST_STEP_RAD, _SETTLED_MM = 15, 0.1, 1e-6
 _FARTHER_MM = 4.0  # maximum extrapolation beyond the captured slides
@@ -52,8 +52,14 @@ _CV_CAP_MM = 1.0
 _TAIL_RIDGE = 1e-6  # penalty that keeps the linear coefficients finite along a direction without motion
 _FRAMES_PER_CENTRE = 4
 _TRIM_FLOOR_MM = 0.5
-_GUIDED_GRID = (9, 7, 7)  # numbers of grid points (opening, sideways, forward) at which the condylar paths predict
-_GUIDED_SHARE = 0.08  # total weight of the predictions relative to that of the frames, for paths without misfit
+_GUIDED_GRID = (
+    9,
+    7,
+    7,
+)  # numbers of grid points (opening, sideways, forward) at which poses are predicted from the condylar paths
+_GUIDED_SHARE = (
+    0.08  # total weight of the predictions from condylar paths relative to that of the frames, for paths without misfit
+)
 
 
 @dataclass(frozen=True)
@@ -131,9 +137,9 @@ class CondylarGuidance:
 
 
 def _kinematic_centre(motion: Array, weights: Array, condyle: Array) -> Array:
-    """Return the point near a condyle landmark whose height is best explained by its slide [mm], shape (3,).
+    """Return the point [mm] near a condyle landmark whose height is best explained by its forward slide, shape (3,).
 
-    The search varies only its vertical and anterior coordinates, since all points on the condylar axis move alike.
+    The search varies only the vertical and anterior coordinates, since all points on the condylar axis move alike.
     """
     root = np.sqrt(weights / _FRAMES_ALIKE)
 
@@ -218,7 +224,7 @@ class _Chart:
 
 
 def _regress(data: TrainingData, u: Array, kept: Mask, chart: _Chart, guided: bool) -> tuple[AnchoredModel, float]:
-    """Fit f to the rotation that best explains each frame's pose with the incisal point fixed at u.
+    """Fit the map f from u to the rotation that best explains each frame's pose with the incisal point fixed at u.
 
     The smoothing factor is chosen again in every call, since f may be less stiff once outliers are trimmed.
     """

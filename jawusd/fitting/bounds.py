@@ -45,7 +45,7 @@ _FOLDS, _BLOCK = 5, 50  # number of folds, and length of their blocks [frames], 
 # empty.
 _MARGIN_MM = 0.38
 _CONTACT_TOLERANCE_MM = 0.05  # extension of the hull below the captured openings
-_FRAMES_PER_SLIP = 400  # number of frames of which noise may place one beyond closed teeth
+_FRAMES_PER_SLIP = 400  # number of frames per frame that noise may place beyond closed teeth
 _SHORTEST_RANGE_MM = 1.0
 _TOLERANCE_QUANTILE, _LARGEST_TOLERANCE_MM = 0.95, 1.0
 
@@ -130,7 +130,7 @@ def _hull(d: Array, closed_mm: float | None) -> dict[str, Array]:
     angle = 2 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS
     directions = np.stack([np.cos(angle), np.sin(angle) * _PROTRUSION_STRETCH], axis=-1)
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    # The margin also extends the hull beyond closed teeth, so subtract it there.
+    # The margin also extends the hull beyond closed teeth, so it is subtracted at that end.
     closed = float(np.sort(d[:, 0])[len(d) // _FRAMES_PER_SLIP]) if closed_mm is None else closed_mm
     low, high = closed + _MARGIN_MM - _CONTACT_TOLERANCE_MM, float(d[:, 0].max())
     knots = np.linspace(low, max(high, low + _SHORTEST_RANGE_MM), KNOTS)

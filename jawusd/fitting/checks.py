@@ -31,7 +31,8 @@ _UNITS = {"metres": 1000.0, "centimetres": 10.0, "inches": 25.4, "micrometres": 
 
 # Ranges of motion below which a take should be repeated; nearly all adults exceed them (Hirsch 2006, Zawawi 2003).
 _SMALL_OPENING_MM, _SMALL_LATERAL_MM, _SMALL_PROTRUSION_MM = 30.0, 5.0, 4.0
-_WIDE, _FEW_WIDE_FRAMES = 0.85, 10  # minimum fraction of the largest opening in wide frames, and their minimum number
+# Minimum fraction of the largest opening for a frame to count as wide open, and minimum number of such frames.
+_WIDE, _FEW_WIDE_FRAMES = 0.85, 10
 _HALF_OPEN = (0.25, 0.65)  # fractions of the largest opening between which the mouth counts as half open
 _HALF_OPEN_SHARE = 0.35  # minimum fraction of the full range that should be reached with the mouth half open
 # Movements with the mouth half open: number of directions in the plane of laterotrusion and protrusion, distance from

@@ -18,7 +18,7 @@ from jawusd.geometry import LANDMARKS, hat, orthonormalise, rigidity_defect, so3
 #: Tracks, or frame numbers (F,) and poses T_skull_mandible (F, 4, 4), which are NaN where unknown.
 Source = Tracks | tuple[ArrayLike, ArrayLike]
 
-#: Names of d1, d2 and d3.
+#: Names of the parameters d1, d2 and d3.
 PARAMETERS = ("opening", "laterotrusion", "protrusion")
 #: Typical deviation of real jaws from a three-parameter model [mm]; smaller tracking errors hardly matter.
 MODEL_SIGMA_MM = 0.3
@@ -28,8 +28,11 @@ _FEWEST_POSES = 15
 _SMALLEST_MOTION_MM = 1.0  # minimum 95 % quantile of the mandible's rms displacement from the first pose
 
 _FEWEST = 60  # minimum number of poses for outlier screening
-_TRIALS, _SAMPLE = 300, 15  # number of random samples, and size of a sample; each output component has ten unknowns
-_CONSENSUS = 0.75  # minimum fraction of the poses that must agree with the map
+_TRIALS, _SAMPLE = (
+    300,
+    15,
+)  # number of random samples, and number of poses in a sample; each output component has ten unknowns
+_CONSENSUS = 0.75  # minimum fraction of the poses that must agree with the quadratic map
 _REFITS = 3
 # Outlier thresholds: relative to the majority's spread, and absolute [mm, rms over the mandible]. A real jaw deviates
 # from the quadratic map by one or two millimetres at its borders; smaller failures are trimmed by the smooth models
@@ -280,7 +283,7 @@ def screened(selection: Selection) -> Selection:
 
 
 def gross_outliers(data: TrainingData) -> Mask:
-    """Return a mask (N,) of poses centimetres off the majority's quadratic map; all false for less than 60 poses."""
+    """Return a mask (N,) of poses centimetres off the majority's quadratic map; all false for fewer than 60 poses."""
     count = len(data)
     if count < _FEWEST:
         return np.zeros(count, dtype=bool)

@@ -19,7 +19,7 @@ COARSE_S, _FINE_S, _FINE_STEPS = 0.1, 0.01, 15  # offset search: coarse step, fi
 _BLOCKS = 5  # number of contiguous blocks in cross-validation
 _LEAST_SECONDS = 10.0
 _LEAST_REACH = 0.4  # minimum fraction of the subject's range that a take must reach in each direction
-_LEAST_FOLLOWING = 0.7  # minimum correlation of JawOpen with the opening; takes of different motion stay below it
+_LEAST_FOLLOWING = 0.7  # minimum correlation of JawOpen with the opening; takes of different performances stay below it
 _DIRECTIONS = ("opening", "movement to the left", "movement to the right", "movement forward")
 
 
@@ -29,7 +29,7 @@ class ArkitFit:
 
     mapping: ArkitMapping
     error_mm: float  # mean error of the incisal point on held-out parts
-    shares_error_mm: float  # error if the weights are used as fixed fractions of the subject's ranges
+    shares_error_mm: float  # mean error if the weights are used as fixed fractions of the subject's ranges
     offset_s: float  # jaw time minus face time, each counted from its own first frame
     frames: int  # number of jaw frames from which the mapping was learned
 
@@ -109,7 +109,7 @@ def columns_at(face_s: Array, weights: Array, times_s: Array) -> Array:
 
 
 def offsets_between(face_s: Array, times_s: Array) -> Array:
-    """Return the candidate offsets [s] between the clocks of a face capture and a jaw take that overlap by half a take.
+    """Return the candidate clock offsets [s] at which a face capture and a jaw take overlap by at least half a take.
 
     Raises:
         FittingError: one of the takes is too short.
@@ -145,7 +145,7 @@ def _best_offset(face_s: Array, weights: Array, times_s: Array, d: Array) -> flo
 
 
 def refined_offset(offset_s: float, face_s: Array, weights: Array, times_s: Array, d: Array) -> float:
-    """Return the offset [s] near an initial one at which all columns (F, K) together predict d best."""
+    """Return the clock offset [s] near an initial one at which all columns (F, K) together predict d best."""
     tried = offset_s + _FINE_S * np.arange(-_FINE_STEPS, _FINE_STEPS + 1)
     left = []
     for offset in tried:

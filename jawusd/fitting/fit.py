@@ -48,7 +48,7 @@ _TRAINED_QUANTILE, _UNSEEN_QUANTILE = 99.8, 99.5
 _SMALLEST_RESIDUAL_LIMIT_MM = 0.1  # minimum residual limit, for noise-free training poses
 _FEW_POSES = 100
 
-#: Fitters by method; `jawusd.paper.model.FORMS` adds the paper's own, which needs torch.
+#: Fitters by method; `jawusd.paper.model.FORMS` adds the fitter of the paper, which needs torch.
 FORMS: Mapping[str, FormFitter] = {
     "anchored": lambda data, shown, config: fit_anchored(data, shown, config.trim_mad),
     "additive": lambda data, shown, config: fit_additive(data, shown, config.trim_mad),

@@ -49,7 +49,7 @@ class GaugeFit:
 
 
 def path_gauge(coefficients: Array, scale_mm: float, limits: tuple[float, float]) -> Gauge:
-    """Return a gauge with a habitual path but no glide surface; arguments as in `Gauge`."""
+    """Return a gauge with a habitual path but no glide surface; the arguments are those of `Gauge`."""
     return Gauge(coefficients, scale_mm, limits, np.zeros(7), np.zeros(4), SOFTNESS_MM, FADE_MM)
 
 

@@ -39,7 +39,7 @@ class MandibleMetric:
         return cls(landmark_vectors(points), extremes)
 
     def rms(self, M: Array, target: Array) -> Array:
-        """Return the RMS distance between points moved by M (N, 4, 4) and by target (N, 4, 4) [mm], shape (N,)."""
+        """Return the RMS distance [mm] between the points moved by M (N, 4, 4) and by target (N, 4, 4), shape (N,)."""
         difference = vector_images(*_parts(M), self.vectors) - vector_images(*_parts(target), self.vectors)
         return np.linalg.norm(difference, axis=(1, 2))
 

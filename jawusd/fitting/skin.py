@@ -115,7 +115,7 @@ def fit_skin(
 
 
 def clock_offset(face_s: Array, X: Array, times_s: Array, d: Array) -> float:
-    """Return the clock offset [s] of a face and a jaw at which the face best explains opening and laterotrusion.
+    """Return the clock offset [s] between face and jaw data at which the face best explains opening and laterotrusion.
 
     Args:
         face_s: times of the face [s], shape (F,).
@@ -290,7 +290,7 @@ def _carried(d: Array, blocks: list[Indices]) -> Array:
 
 
 def _of_chin(rig: JawRig, X: Array, d: Array, blocks: list[Indices]) -> Array:
-    """Return d (M, 3) of held-out blocks by inverse kinematics of the points that best follow the bone."""
+    """Return d (M, 3) of held-out blocks by inverse kinematics of the skin points that best follow the bone."""
     poses, found = rig.pose(d), np.empty_like(d)
     for b in blocks:
         others = np.delete(np.arange(len(d)), b)

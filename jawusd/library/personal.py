@@ -28,7 +28,7 @@ class Donor:
     """One subject of a library."""
 
     name: str  # name of the subject, for reports
-    rig: JawRig  # the subject's rig
+    rig: JawRig  # rig of the subject
 
     @property
     def landmarks(self) -> Array:

@@ -16,11 +16,11 @@ import numpy as np
 
 from jawusd.base.arrays import Array, Mask
 
-STILL_MM = 1e-6  # maximum step of the original that counts as having no direction
+STILL_MM = 1e-6  # maximum step of the original curve that counts as having no direction
 
 
 def follow(original: Array, carried: Array, least: float) -> Array:
-    """Return the curve (F,) [mm] nearest to a retargeted curve among all that rise and fall with the original (F,).
+    """Return the curve (F,) [mm] nearest to a retargeted curve among all curves that rise and fall with the original.
 
     Args:
         least: Minimum step of the result per 1 mm step of the original, > 0; it keeps peaks from becoming plateaus.

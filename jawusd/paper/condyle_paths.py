@@ -18,7 +18,7 @@ _STEPS = 121
 _SHOWN_OPENINGS = (0.0, 1 / 3, 2 / 3, 1.0)  # fractions of a path at which the outline of the condyle is drawn
 _AROUND_MM = 24.0  # radius around the condyle's centre within which bone is drawn
 _NEAR_CLOSED_MM = 5.0
-_HABITUAL_MM = 1.5  # maximum |d2| and |d3| of captured poses that count as plain opening
+_HABITUAL_MM = 1.5  # maximum |d2| and |d3| of captured poses that count as pure opening
 _BESIDE_MM = 0.75  # maximum difference in z of the captured condyles that limit the height of a path point
 _FEWEST_BESIDE = 3
 
@@ -126,7 +126,7 @@ def path_distances(paths: list[CondylePath], captured: Array, d: Array) -> list[
         d: parameters of the captured poses in the default model [mm], shape (N, 3).
 
     Returns:
-        For each path, the distances of its points from the nearest captured condyle centre during plain opening, and
+        For each path, the distances of its points from the nearest captured condyle centre during pure opening, and
         their heights above the highest captured condyle centre nearby; positive heights are anatomically impossible.
     """
     habitual = captured[:, np.all(np.abs(d[:, 1:]) < _HABITUAL_MM, axis=1)]

@@ -192,7 +192,8 @@ class GlCounter:
         flags = np.full((views, size[1], size[0]), 2, np.uint8)
         flags[:, :height, :width] = masks + np.uint8(2) * free
         self._masks.write(flags, alignment=1)
-        # Pixel to clip coordinates, x_ndc = (2 u + 1) / w - 1, without depth; image row 0 is row 0 of the target.
+        # Pixel to clip coordinates, x_ndc = (2 u + 1) / w - 1, without depth; image row 0 becomes row 0 of the render
+        # target.
         to_clip = np.array([[2 / size[0], 0, 1 / size[0] - 1], [0, 2 / size[1], 1 / size[1] - 1], [0, 0, 0], [0, 0, 1]])
         self._to_clip = to_clip @ np.asarray(matrices, np.float64)
 
@@ -228,7 +229,7 @@ class GlCounter:
 
     def _draw(self, target: _Target, matrices: moderngl.Buffer, layers: int) -> None:
         self._gl.enable_only(self._flags)
-        self._gl.front_face = "cw"  # mirrored vertically: image row 0 is drawn to the bottom row
+        self._gl.front_face = "cw"  # flipped vertically: image row 0 is drawn to the bottom row of the render target
         target.frame.use()
         target.frame.clear()
         matrices.bind_to_storage_buffer(0)

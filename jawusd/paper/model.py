@@ -191,7 +191,7 @@ def _groups_by_incisal_motion(net: Nlpca, points: Array, root: Array, incisor: A
 
 
 def _with_leftovers(base: _Sum, points: Array, error: Callable[[_Sum], float]) -> _Sum:
-    """Return the best sum over all assignments of the remaining components to one of the three groups or to none."""
+    """Return the best model over all assignments of each remaining component to one of the three groups or to none."""
     used = {part.group[0] for part in base.parts}
     left = [index for index in range(base.net.components) if index not in used]
     components = base.net.encode(points)
@@ -237,7 +237,7 @@ def _shifted(part: _Part, net: Nlpca, rest: float, root: Array) -> Curve:
 
 
 def _rebuilt(found: _Sum, motion: Array, root: Array) -> Array:
-    """Return motions (N, 4, 4) after encoding and decoding by a sum."""
+    """Return motions (N, 4, 4) after encoding and decoding by a sum of parts."""
     return _motions(found.value(found.encode(se3_log(motion) @ root)), root)
 
 

@@ -3,7 +3,7 @@
 Scholz & Vigario, "Nonlinear PCA: a new hierarchical approach" (2002), with the defaults of Scholz's toolbox: layers
 d-(2+2k)-k-(2+2k)-d with tanh hidden units, half the summed squared error of the reconstructions from the first 1, 2,
 .. k components plus 0.01 times that from all but the first, weight decay 1e-3, data scaled to a largest standard
-deviation of 0.1, weights initialised in U(-0.1, 0.1), and components reordered while training.
+deviation of 0.1, weights initialised in U(-0.1, 0.1), and components reordered during training.
 """
 
 from __future__ import annotations

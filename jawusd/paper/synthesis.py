@@ -17,7 +17,8 @@ from jawusd.fitting.metric import MandibleMetric
 POSES = 1000
 BOX, POLYGONS, SLICES = "static: box", "dynamic: two polygons", "dynamic: slice hull"
 
-_BATCH, _BATCHES = 4000, 50  # size and number of batches; bounds that fill < 0.5 % of their box give fewer than `POSES`
+# Size and number of batches; bounds that fill less than 0.5 % of their box give fewer than `POSES` poses.
+_BATCH, _BATCHES = 4000, 50
 
 
 @dataclass(frozen=True, eq=False)

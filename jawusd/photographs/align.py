@@ -25,9 +25,10 @@ _STAGES = (
 )
 _AT_WIDTH_PX = 1440.0  # reference image width, to which distances in pixels are scaled
 _TURN_PX = 10.0  # weight of direction when lines are matched to outlines (see `features`), at the reference width
-_CLEAR_MISFIT = 0.2  # maximum misfit of a photograph whose bite is used to initialise the others
+_CLEAR_MISFIT = 0.2  # maximum misfit of a photograph whose bite initialises the other photographs
 _GATE_MM, _MOST_MISFIT = 0.5, 0.45  # gate of the final misfit, and maximum final misfit of scans of the same subject
-_SAME_HAND = 1.15  # minimum ratio of the misfits with the other and the chosen mirroring for a clear choice
+# Minimum ratio of the misfit with the opposite mirroring to that with the chosen one, for a clear choice.
+_SAME_HAND = 1.15
 _APART_MM = 1.5  # maximum plausible distance between the bite from one photograph and the bite from all
 
 

@@ -20,7 +20,8 @@ from jawusd.tracking.contour.scan import Scan, thinned
 
 _PX_PER_MM = 2.5
 _DISTANCE_MM = 200.0  # typical camera distance of dental photographs
-_FRONT_MM = np.array([0.0, 0.0, 15.0])  # front edges relative to the centre of rotation of the views
+# Position of the front teeth's edges relative to the centre of rotation of the views.
+_FRONT_MM = np.array([0.0, 0.0, 15.0])
 _YAW = np.radians(np.arange(-75, 76, 15.0))
 _PITCH = np.radians(np.arange(-20, 21, 10.0))
 _ROLL = np.radians([-10.0, 0.0, 10.0])
@@ -28,13 +29,14 @@ _ROLL = np.radians([-10.0, 0.0, 10.0])
 _WIDTHS_MM = 38.0 * 1.1 ** np.arange(9)
 _ROWS_APART_MM = 10.0
 _SECTORS = 4  # number of direction bins; a line matches only outlines in the same bin
-_NEAR_PX = 2.0  # distance from an outline at which a line has half weight
+_NEAR_PX = 2.0  # distance from an outline at which a drawn line has half weight
 # Typical bite: overjet and overbite of the front teeth [mm].
 _OVERJET_MM, _OVERBITE_MM = 2.5, 2.0
 
 _WIDTH_PX = 360  # image width at which candidates are aligned
 _FACES = 6000  # number of crown faces per arch, sufficient at this image width
-_CANDIDATES, _FINALISTS = 20, 4  # number of candidates and of finalists, each for mirrored and for not mirrored views
+# Number of candidates and of finalists, separately for mirrored and for unmirrored views.
+_CANDIDATES, _FINALISTS = 20, 4
 # Gates of the alignment steps [mm], with the given bite and with shifted bites; they decrease from step to step.
 _WIDE_GATES, _SLID_GATES = (4.0, 4.0, 3.5, 3.5, 3.0, 3.0, 2.5, 2.5), (3.0, 3.0, 2.5, 2.0, 2.0, 2.0)
 # Shifts of the lower arch from a typical bite: all are scored, and the best `_SLIDES` are aligned.
@@ -117,7 +119,7 @@ def searched(
         crowns: upper and lower, decimated for fast rendering.
         usual: typical bite, which defines the anatomical axes.
         T_upper_lower: the assumed bite, shape (4, 4).
-        count: number of mirrored candidates to return, and of not mirrored ones.
+        count: number of mirrored candidates to return, and number of unmirrored candidates.
     """
     size = next_fast_len(int(1.3 * _PX_PER_MM * _WIDTHS_MM.max()), real=True)
     drawn = list(_drawn_spectra(drawing, size))
@@ -214,7 +216,7 @@ class PhotoStart:
     """Initial pose of one photograph."""
 
     misfit: float  # misfit of its lines (see `Aligner.misfit`) [-]
-    other_misfit: float  # smallest misfit with the opposite choice of mirroring
+    other_misfit: float  # smallest misfit of a start with the opposite mirroring
     mirrored: bool
     bite: Bite  # pose and bite from this photograph alone, at reduced size
     rows: ArchPair
@@ -279,7 +281,7 @@ def _aligned_candidates(
 
 
 def _finalists(tried: Sequence[tuple[float, bool, Bite, ArchPair]]) -> list[tuple[float, bool, Bite, ArchPair]]:
-    """Return the best starts, with equal numbers of mirrored and not mirrored starts for a fair comparison."""
+    """Return the best starts, with equal numbers of mirrored and unmirrored starts for a fair comparison."""
     ordered = sorted(tried, key=lambda one: one[0])
     return [one for way in (False, True) for one in [o for o in ordered if o[1] is way][:_FINALISTS]]
 

@@ -27,7 +27,7 @@ UNKNOWNS = 8
 
 _SIGMA_MM = 0.15  # standard deviation of the gap or penetration between scanned teeth that are in contact
 _SHARE = 0.04  # fraction of the lower crown points on each side that are assumed to be in contact
-_REACH_MM = 3.0  # maximum penetration; deeper points lie beyond the base of a crown
+_REACH_MM = 3.0  # maximum penetration; points that seem deeper lie beyond the base of a crown
 # Priors: camera distance, standard deviation of its logarithm, and standard deviation of the distortion [-]. Phones are
 # held 80 to 200 mm from the teeth, macro lenses 200 to 400 mm.
 _DISTANCE_MM, _LOG_DISTANCE, _DISTORTION = 180.0, 0.5, 0.02

@@ -72,7 +72,7 @@ if __name__ == "__main__":
     given, failed = sys.argv[sys.argv.index("--") + 1 :], False
     try:
         convert(given[0], given[1], float(given[2]))
-    except Exception:  # the last line of the traceback is what jawusd reports
+    except Exception:  # jawusd reports the last line of the traceback
         traceback.print_exc()
         failed = True
     sys.stdout.flush()

@@ -41,7 +41,7 @@ _LANES = ("tracked", "recovered", "without a camera", "lost", "regularised")
 _LANE_COLORS = (GREEN, SKY, ORANGE, VERMILION, BLUE)
 _COLOURS = (BLUE, ORANGE, GREEN, VERMILION, SKY, BLACK, GREY)
 _AROUND_FRAMES = 12  # number of frames drawn before and after a flash
-_APART_FRAMES = 48  # maximum number of frames between two light steps of the same flash
+_APART_FRAMES = 48  # maximum number of frames between the two light steps of one flash
 _QUANTILE = 99.5  # percentile taken as the end of a range of motion, robust to single outliers
 _NEAR_CLOSED_MM = 5.0  # maximum opening at which protrusion is measured, as in clinical practice
 
@@ -108,7 +108,7 @@ def model_figure(model: JawModel) -> Figure:
 
 
 def _draw_state(axis: Axes, tracks: Tracks) -> None:
-    """Draw a lane per frame state, upper teeth above lower teeth, so that the plot is legible without colour."""
+    """Draw one lane per tracking state, upper teeth above lower teeth, so that the plot is legible without colour."""
     states = [tracks.status == value for value in (TRACKED, RECOVERED, PARTIAL, LOST)]
     states.append(np.repeat(tracks.prior_aided[:, None], 2, axis=1))
     for lane, (has, color) in enumerate(zip(states, _LANE_COLORS, strict=True)):
@@ -131,7 +131,7 @@ def runs(frames: NDArray[np.int64], has: Mask) -> list[tuple[float, float]]:
 
 def _mean_of_known(values: Array, axis: int) -> Array:
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # frames without any mask have no mean
+        warnings.simplefilter("ignore", RuntimeWarning)  # the mean is undefined in frames without any mask
         return np.nanmean(values, axis=axis)
 
 

@@ -14,7 +14,7 @@ from jawusd.formats.report import ReplayPart, ReportData
 from jawusd.formats.tracks import LOST, PARTIAL, RECOVERED, Tracks
 from jawusd.geometry import transform_points
 
-#: Names of the frame states.
+#: Names of the tracking states of frames.
 STATES = ("tracked", "recovered after a loss", "tracked without a camera", "lost", "regularised by the model")
 _MOST_FRAMES = 6000  # maximum number of frames; longer takes are subsampled
 _DEFAULT_FPS = 24.0

@@ -20,7 +20,8 @@ def page_environment() -> jinja2.Environment:
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
-        finalize=lambda value: shown(value) if type(value) is str else value,  # this package's HTML is of type Markup
+        # HTML from this package is of type Markup
+        finalize=lambda value: shown(value) if type(value) is str else value,
     )
     environment.filters |= {"worded": worded, "figure": figure}
     return environment

@@ -22,10 +22,10 @@ MARKS = {GOOD: "\u2714", LOOK: "!", BAD: "\u2716", OPEN: "?"}
 _PAPER_COVERAGE_PERCENT, _PAPER_MEAN_MM, _PAPER_WORST_MM = 0.754, 1.73, 7.22
 _UNKNOWN = "not known"
 _EXERCISES = "full opening, slides to both sides and protrusion, closed and half open"
-# Kinds of findings in tracks that mean an unused camera or wrong scans.
+# Kinds of findings in tracks that indicate an unused camera or wrong scans.
 _UNUSED = {"camera_without_masks", "masks_black", "camera_not_used", "camera_rarely_used"}
 _WRONG_SCANS = {"scan_misfit", "scans_mirrored"}
-_LACKING = {"take_lacks", "not_shown"}  # fit warnings about movements that are missing or too small
+_LACKING = {"take_lacks", "not_shown"}  # codes of fit warnings about movements that are missing or too small
 _MISTAKES = {"scan_units", "pose_units", "front_back_flip", "left_right_flip", "upside_down", "swapped_jaws"}
 _RECORD = "Re-record: "
 _MASKS = "Check the masks and the calibration in the frames to inspect."
@@ -288,7 +288,7 @@ def _bounds(data: ReportData) -> Verdict:
                 f"{_RECORD}slow circling at every opening.",
             )
         )
-    # Use the values of the experiments, so that the verdict agrees with the plot.
+    # The values of the experiments are used, so that the verdict agrees with the plot.
     warned = [w["message"] for w in meta.get("warnings", []) if w["code"] in _LACKING]
     lacks = data.experiments.coverage.sentences if data.experiments else warned
     checks += [Check("captured movements", sentence, _EXERCISES, LOOK, _movement(sentence)) for sentence in lacks]

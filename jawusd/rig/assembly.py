@@ -40,7 +40,7 @@ def faults_of_assembly(actor: Usd.Prim) -> Iterator[Fault]:
     except FormatError as error:
         if error.message.startswith("jaw:skull"):
             yield Fault("error", actor, error.message)
-        return  # reported by the rule for the mandible
+        return  # the rule for the mandible reports this fault
     if skull is None:
         yield Fault("warning", actor, "has no active skull (jaw:skull).")
     elif skull.GetPath().HasPrefix(mandible.GetPath()) or mandible.GetPath().HasPrefix(skull.GetPath()):
@@ -90,7 +90,7 @@ def _shape(actor: Usd.Prim) -> Iterator[Fault]:
     axes = np.array([_axes(actor, time) for time in times])
     scales = np.linalg.svd(axes, compute_uv=False)
     uneven = scales[:, 0] - scales[:, 2] > _UNEVEN * scales[:, 0]
-    mirrored = np.linalg.det(axes) < 0  # not meaningful if a scale is zero
+    mirrored = np.linalg.det(axes) < 0  # the axes are not meaningful if a scale is zero
     if uneven.any():
         first = int(np.argmax(uneven))
         listed = ", ".join(f"{scale:.4g}" for scale in scales[first])
@@ -105,7 +105,7 @@ def _resets(actor: Usd.Prim, parts: list[Usd.Prim]) -> Iterator[Fault]:
     """Find prims in an actor that reset the transform stack."""
     meshes = [mesh for part in parts for mesh in meshes_below(part)]
     for prim in dict.fromkeys(above for mesh in meshes for above in prims_between(mesh, actor)):
-        if prim not in parts[-1:] and UsdGeom.Xformable(prim).GetResetXformStack():  # the mandible has its own rule
+        if prim not in parts[-1:] and UsdGeom.Xformable(prim).GetResetXformStack():  # another rule checks the mandible
             yield Fault("error", prim, "!resetXformStack! detaches it from the actor.")
 
 

@@ -36,8 +36,8 @@ def is_layer(asset: str) -> bool:
 def target_of(layer: Sdf.Layer, asset: str) -> str | None:
     """Return the full path of an asset of a layer, as resolved by OpenUSD, or the expected path of a missing file.
 
-    Return None for paths of another system, such as one with a drive letter, and for URLs whose scheme no resolver
-    supports. The resolver context of the stage must be bound.
+    Return None for paths of another operating system, such as one with a drive letter, and for URLs whose scheme no
+    resolver supports. The resolver context of the stage must be bound.
     """
     path, arguments = Sdf.Layer.SplitIdentifier(layer.ComputeAbsolutePath(asset))
     found = str(Ar.GetResolver().Resolve(path))
@@ -75,7 +75,7 @@ def asset_paths(layer: Sdf.Layer) -> list[str]:
     UsdUtils.ModifyAssetPaths(layer, note)
     del silent
     if layer.dirty and not edited and not layer.anonymous:
-        layer.Reload(force=True)  # restores the expressions, which evaluation has replaced by their values
+        layer.Reload(force=True)  # restores the expressions, which were replaced by their values
     return [asset for asset in dict.fromkeys(found) if asset]
 
 

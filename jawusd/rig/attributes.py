@@ -2,7 +2,7 @@
 
 To add a format version:
 
-1. Raise `layout.FORMAT_VERSION`.
+1. Increment `layout.FORMAT_VERSION`.
 2. Add the upgrade from the previous version to `UPGRADES`. It derives the new attributes from the old ones.
 3. Write golden rigs of the new version with `tests/golden/make_golden_rig.py`; keep the old ones for tests.
 4. Do the same in `plugins/jawusd_reader.py`.
@@ -28,7 +28,7 @@ from jawusd.rig.layers import set_attribute
 from jawusd.rig.layout import FORMAT_VERSION
 
 if TYPE_CHECKING:
-    from pxr import Ts  # not in OpenUSD 24.11
+    from pxr import Ts  # missing in OpenUSD 24.11
 
 
 _TYPES = Sdf.ValueTypeNames
@@ -116,7 +116,7 @@ def value_of(attribute: Usd.Attribute, where: object, time: Usd.TimeCode | None 
     return value
 
 
-MAX_FRAMES = 220_000  # maximum number of times: an hour at 60 frames per second, as for writing
+MAX_FRAMES = 220_000  # maximum number of sample times: an hour at 60 frames per second, as for writing
 
 
 def key_times(attribute: Usd.Attribute) -> list[float]:

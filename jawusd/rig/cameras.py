@@ -171,7 +171,7 @@ def read_cameras(path: str | os.PathLike[str], sizes: Callable[[], Mapping[str, 
     stage = open_stage(path)
     mm = UsdGeom.GetStageMetersPerUnit(stage) * 1000.0
     cameras = [prim for prim in stage.Traverse() if prim.IsA(UsdGeom.Camera)]
-    # skips orthographic cameras: they are the top and side views of 3-D programs
+    # skips orthographic cameras, which are the top and side views of 3-D programs
     prims = [prim for prim in cameras if UsdGeom.Camera(prim).GetProjectionAttr().Get() != "orthographic"]
     names = names_of_labels(Path(path), [str(prim.GetPath())[1:] for prim in prims])
     known: Mapping[str, tuple[int, int]] | None = None

@@ -79,7 +79,7 @@ def read_look(prim: UsdGeom.Mesh, vertices: int, faces: int) -> tuple[NDArray[np
 
 
 def _values(primvar: UsdGeom.Primvar, shape: tuple[int, int]) -> Array | None:
-    """Return the values of a primvar; None if they have another shape or are not finite."""
+    """Return the values of a primvar; None if their shape is not the expected one or they are not finite."""
     found = np.array((primvar.ComputeFlattened() if primvar else None) or (), dtype=np.float64)
     return found if found.shape == shape and np.isfinite(found).all() else None
 
@@ -187,7 +187,7 @@ def _define_mesh(
     prim.CreateFaceVertexCountsAttr(_gf.int_array(np.full(len(mesh.faces), 3)))
     prim.CreateExtentAttr(_gf.vec3f_array(extent(mesh.vertices)))
     prim.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
-    prim.CreateDoubleSidedAttr(True)  # double-sided, because scans are open surfaces
+    prim.CreateDoubleSidedAttr(True)  # meshes are double-sided, because scans are open surfaces
     prim.CreateNormalsAttr(_gf.vec3f_array(corner_normals(mesh)))
     prim.SetNormalsInterpolation(UsdGeom.Tokens.faceVarying)
     gum = ~crown_face_mask(mesh) if base == "Enamel" else np.zeros(len(mesh.faces), dtype=bool)

@@ -19,7 +19,7 @@ from jawusd.rig.geo import MATERIAL_LOOKS, MESH_PATHS, linear_from_srgb, read_ge
 from jawusd.rig.layout import MANDIBLE, SKULL
 
 _HIGHEST_FRAME = 100_000.0  # largest frame number at which single precision resolves a hundredth of a frame
-_SCAN = "Scan"  # name of the material of scans, white because vertex colours are multiplied by it
+_SCAN = "Scan"  # name of the material of scans, which is white because vertex colours are multiplied by its colour
 
 
 def write_glb(

@@ -105,7 +105,7 @@ def poses_in_actor(prim: Usd.Prim, actor: Usd.Prim, times: Sequence[Usd.TimeCode
 
 
 def moving_attributes(prim: Usd.Prim, actor: Usd.Prim) -> list[Usd.Attribute]:
-    """Return the attributes that move a prim in its actor: of joints, or transform ops of the prims up to the actor."""
+    """Return the attributes that move a prim in its actor: those of joints, or of prims up to the actor."""
     bones = bones_of(prim)
     if bones is not None:
         return bones.animated_attributes()

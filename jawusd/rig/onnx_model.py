@@ -31,7 +31,7 @@ _FIRST_NEWTON = 5  # first iteration with the full Hessian, which is often misle
 _CONVERGED_MM = 1e-5
 _STARTS = (19, 11, 11)  # number of starts along d1, d2, d3
 _START_MARGIN_MM = 3.0  # extension of the grid beyond the bounds, for poses slightly outside
-_STEP_MM = 1e-3  # step of the differences in d
+_STEP_MM = 1e-3  # step of the finite differences in d
 _START_DAMPING = 1e-6
 _MIN_DAMPING = 1e-12
 # Numbers of columns for a point of the search: d, its cost (squared distance), half the gradient of the cost, and half
@@ -95,7 +95,7 @@ def add_encoder(g: Graph, rig: JawRig, pose: Value, d: str, residual: str) -> No
     target = f.op("MatMul", flat, f.constant(_images_of_pose(vectors)), name="target")
     start = _nearest_start(f, rig, vectors, target)
     unknown = np.array([[np.inf, *[0.0] * 15]])  # the start is evaluated in the first iteration
-    point = f.concat([start, target @ np.zeros((12, 16)) + f.constant(unknown)])  # keeps NaN of the pose
+    point = f.concat([start, target @ np.zeros((12, 16)) + f.constant(unknown)])  # propagates NaN from the pose
     damping = start @ np.zeros((3, 1)) + _START_DAMPING
     some = f.op("Greater", f.op("Size", target), f.constant(0, np.int64))
     state = [f.constant(_ITERATIONS, np.int64), some, point, start, damping]
@@ -141,7 +141,7 @@ def _nearest_start(g: Graph, rig: JawRig, vectors: Array, target: Value) -> Valu
 def _body(rig: JawRig, vectors: Array) -> onnx.GraphProto:
     """Return the loop body: a damped step of Newton's method, accepted if it reduces the cost.
 
-    In the first iterations, and where the Hessian is not positive definite, the Gauss-Newton approximation replaces it
+    In the first iterations, and where the Hessian is not positive definite, the Gauss-Newton approximation is used
     (Nocedal and Wright 2006, section 10.3).
     """
     b = Graph(np.float64, "b_")

@@ -37,7 +37,7 @@ from jawusd.rig.table import landmark_distance, sample_valid
 
 FORMAT = "jawusd-onnx/1"
 OPSET = 17
-_IR_VERSION = 8  # ONNX file version released with opset 17; older runtimes reject newer ones
+_IR_VERSION = 8  # ONNX file version released with opset 17; older runtimes reject newer versions
 
 #: Maximum landmark distance of a graph's poses from those of the model [mm].
 ALLOWED_MM = 0.01
@@ -276,10 +276,12 @@ def read_sidecar(path: str | os.PathLike[str], recorded: str | None = None) -> o
     try:
         model = onnx.load_from_string(content)
         onnx.checker.check_model(model)
-        convert_model_from_external_data(model)  # fails for weights in external files, which a runtime would open
+        # fails if the weights are stored in external files, because a runtime would open those files
+        convert_model_from_external_data(model)
     except Exception as error:  # the exceptions of protobuf and onnx have no common base class
         raise FormatError(f"is not a valid ONNX file ({type(error).__name__}).", path=path) from error
-    if model.functions or model.graph.sparse_initializer:  # the check above does not look for external data in these
+    # the check above does not search these fields for external data
+    if model.functions or model.graph.sparse_initializer:
         raise FormatError("has functions or sparse weights; graphs written by jawusd have neither.", path=path)
     found = _properties(model).get("format")
     if found != FORMAT:

@@ -41,9 +41,10 @@ _ZIP_EPOCH = 315_619_200
 _OP = "xformOp:"
 _PREFIX = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,63}")
 _LAYERS, _COPIED = (".usda", ".usdc", ".usd"), (".onnx",)
-_FIRST = (GEO_FILE, PROXY_FILE, RIG_FILE, ONNX_FILE, ENCODE_FILE, ACTOR_FILE)  # each file before those that refer to it
+# Files of a rig, each before the files that refer to it.
+_FIRST = (GEO_FILE, PROXY_FILE, RIG_FILE, ONNX_FILE, ENCODE_FILE, ACTOR_FILE)
 _NAMES_INSIDE = "actor.usdc", "shot.usdc"
-# Offset that turns integers into other numbers: binary layers compress vectors of small integers, which three.js (r187)
+# Offset that makes integers non-integer: binary layers compress vectors of small integers, which three.js (r187)
 # decodes as NaN.
 _OFFSET = 1e-9
 

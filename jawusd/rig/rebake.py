@@ -162,7 +162,7 @@ def _actor(stage: Usd.Stage, path: object, rig: JawRig, prim_path: str | None) -
 
 
 def _constant_motion(stage: Usd.Stage, actor: Usd.Prim, path: object) -> tuple[Array, Array, float]:
-    """Return the constant motion of a d without animation: first and last frame, d at both [mm], frames per second."""
+    """Return the motion of a rig whose d is not animated: first and last frame, d at both [mm], frames per second."""
     frames = frames_of_stage(stage, path)[[0, -1]]
     d = np.array([actor.GetAttribute(name).Get() for name in PARAMETERS], dtype=np.float64)
     if not np.isfinite(d).all():
@@ -288,7 +288,7 @@ def _author(layer: Sdf.Layer, actor: Usd.Prim, motion: Rebaked, shot: object) ->
     author_motion(layer, motion.rig, motion.times, motion.d, motion.times[[0, -1]], paths)
     moved = layer.GetPrimAtPath(mandible.GetPath())
     order = Sdf.AttributeSpec(moved, "xformOpOrder", Sdf.ValueTypeNames.TokenArray, Sdf.VariabilityUniform)
-    order.default = Vt.TokenArray(["xformOp:translate", "xformOp:orient"])  # replaces any other ops
+    order.default = Vt.TokenArray(["xformOp:translate", "xformOp:orient"])  # replaces any other transform ops
     if bones_of(mandible) is not None:
         if actor.GetVariantSet(MOTION).GetVariantSelection() != SKELETON:
             raise RigError(
@@ -306,7 +306,7 @@ def _check_moves(layer: Sdf.Layer, prims: list[str], motions: Sequence[Rebaked],
     """Compose a layer over its stage and check that its mandibles have the poses given by d in the world.
 
     Raises:
-        RigError: A mandible has another pose.
+        RigError: The pose of a mandible differs from that given by d.
     """
     root = Sdf.Layer.CreateAnonymous(".usda")
     root.timeCodesPerSecond = layer.timeCodesPerSecond

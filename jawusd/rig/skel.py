@@ -1,4 +1,4 @@
-"""The UsdSkel variant of an actor: the jaw as an animated joint, for tools that edit skeletons but not rigs.
+"""The UsdSkel variant of an actor: the jaw as an animated joint, for tools that edit skeletons but do not support rigs.
 
 Written for every actor, and read from stages in which bones move the meshes (`motion = "skeleton"`).
 """

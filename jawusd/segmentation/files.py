@@ -26,7 +26,7 @@ _UNKNOWN = 128  # gray value of pixels that are not annotated
 _STROKES_UNKNOWN = 0.5  # minimum fraction of unannotated pixels for an image to count as strokes
 _COLUMNS = 3
 _TILE_PX = (480, 270)
-_MARGIN = 0.15  # margin of a tile as a fraction of the extent of the teeth
+_MARGIN = 0.15  # margin of a contact-sheet tile as a fraction of the extent of the teeth
 
 
 def mask_pattern(folder: Path, camera: str, arch: str) -> Path:

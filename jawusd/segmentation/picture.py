@@ -36,7 +36,7 @@ class PictureFrame:
     """Factory of windows around the teeth in the images of one camera."""
 
     def __init__(self, source: Camera, centre_world: Array, px_per_mm: float) -> None:
-        """Choose the working image size from the resolution at the teeth, centre_world (3,) [mm]; never upsample."""
+        """Choose the working image size from the resolution at the teeth, near `centre_world` [mm]; never upsample."""
         recorded = float(np.sqrt(source.K[0, 0] * source.K[1, 1]) / source.depth(centre_world))
         scale = min(1.0, px_per_mm / recorded)
         self.px_per_mm = recorded * scale

@@ -96,7 +96,7 @@ def _teeth(toothlike: Array, redness: Array) -> tuple[Mask, float] | None:
     if best is None:
         return None
     _, inside, outside, group = best
-    # midway between teeth and surroundings, since highlights on lips are brighter than the surroundings
+    # threshold midway between teeth and surroundings, since highlights on lips are brighter than the surroundings
     level = (inside + outside) / 2
     parts, count = ndimage.label(toothlike > level)
     like = ndimage.median(toothlike, parts, np.arange(count + 1)) > outside + _AS_BRIGHT * (inside - outside)
@@ -138,7 +138,7 @@ def _group_contrast(
     toothlike: Array,
     redness: Array,
 ) -> tuple[float, float]:
-    """Return the brightness of a group of teeth and of its surroundings; zeros if they are not redder or darker."""
+    """Return the brightness of teeth and of their surroundings; zeros if the surroundings are not redder or darker."""
     rows, columns = box
     around = (
         slice(max(rows.start - _FAR_PX, 0), rows.stop + _FAR_PX),

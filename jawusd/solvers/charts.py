@@ -1,7 +1,7 @@
 """Models with derivatives, in the chart coordinates x (n, 3) [mm] of the search for the nearest pose.
 
-As in `jawusd.evaluator.models`: for an anchored model x is the displacement u of the incisal point, for others d
-itself; derivatives are spatial, S (n, 6, 3) with ``M(x + e) = exp(S e) M(x)``; twists are (omega [rad], v [mm]).
+As in `jawusd.evaluator.models`: for an anchored model, x is the displacement u of the incisal point; for others, x is d
+itself. Derivatives are spatial, S (n, 6, 3) with ``M(x + e) = exp(S e) M(x)``; twists are (omega [rad], v [mm]).
 """
 
 from __future__ import annotations

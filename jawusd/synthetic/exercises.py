@@ -40,7 +40,7 @@ class Recording:
 
     controls: Array  # opening 0..1, lateral -1..1, protrusion -1..1, shape (F, 3)
     phase: NDArray[np.str_]  # name of the exercise of each frame, shape (F,)
-    T_manifold: Array  # poses that follow from the controls alone
+    T_manifold: Array  # poses determined by the controls alone
     T_true: Array  # `T_manifold` with small movements outside the controls
     T_noisy: Array  # `T_true` with tracking noise
 

@@ -93,7 +93,7 @@ def joint_pose(
     distance = joint.condylar_distance_mm
     spread = np.full(pitch.shape, rest_axis[0])
     middle_x = (left[0] + right[0]) / 2 + shift
-    for _ in range(4):  # condyle heights and lateral positions are coupled; each iteration gains two digits
+    for _ in range(4):  # condyle heights and lateral positions are coupled; each iteration adds two correct digits
         y_left = left[1] + eminence(joint, 0, slides[..., 0], left[0] - middle_x - spread / 2) - lifts[..., 0]
         y_right = right[1] + eminence(joint, 1, slides[..., 1], middle_x - spread / 2 - right[0]) - lifts[..., 1]
         dy, dz = y_left - y_right, rest_axis[2] + slides[..., 0] - slides[..., 1]
@@ -144,7 +144,7 @@ def _coupling(joint: Joint, opening: Array) -> Array:
 
 
 def _protrusive_range(joint: Joint, opening: Array, share: Array, protrusion: Array) -> Array:
-    """Return the forward range of both condyles [mm] or, for negative protrusion, the backward range."""
+    """Return the range of forward slides of both condyles [mm] or, for negative protrusion, of backward slides."""
     forward = joint.protrusion_max_mm * (1.0 - 0.85 * np.clip(share, 0.0, 1.1))
     hinge = joint.hinge_share * joint.slide_open_mm * share * (1.0 - smoothstep((opening - 0.3) / 0.5))
     backward = joint.retrusion_max_mm * (1.0 - np.clip(opening, 0.0, 1.0)) + 0.15 + hinge
@@ -152,7 +152,7 @@ def _protrusive_range(joint: Joint, opening: Array, share: Array, protrusion: Ar
 
 
 def _lateral_range(joint: Joint, opening: Array, mean_mm: Array, lateral: Array) -> Array:
-    """Return the maximum difference between the slides [mm], also limited by the stop of the balancing condyle."""
+    """Return the maximum difference between both condyles' slides [mm], limited by the balancing condyle's stop."""
     own = np.where(lateral > 0, joint.lateral_max_mm[0], joint.lateral_max_mm[1])
     own = own * (1.0 - joint.lateral_shrink * np.clip(opening, 0.0, 1.1) ** 1.1)
     room = (joint.slide_limit_mm + 1.2 - mean_mm) / (joint.working_share - 0.45 * smoothstep(opening))

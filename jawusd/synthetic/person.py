@@ -26,7 +26,7 @@ PoseFunction = Callable[[Array, Array, Array], Array]
 _LOWER = np.array([0.0, -1.0, -1.0])
 _UPPER = np.array([1.0, 1.0, 1.0])
 _GRID = (13, 9, 9)
-# Number of Gauss-Newton steps; so many are needed near zero protrusion, where the manifold has a kink.
+# Number of Gauss-Newton steps; this many are needed near zero protrusion, where the manifold has a kink.
 _STEPS = 30
 _DIFFERENCE = 1e-5
 # Damping relative to the scale of each control, since the controls' gradients differ by a factor of ten.

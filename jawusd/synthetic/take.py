@@ -1,4 +1,4 @@
-"""A studio, a performance in front of its cameras, and the scene in each frame.
+"""A synthetic studio, a performance in front of its cameras, and the scene in each video frame.
 
 A studio has a chessboard, and three cameras about 200 mm from the mouth. A take samples jaw, head, lips, tongue and
 light once per frame; the scene poses the subject's surfaces in a frame and renders them.
@@ -162,7 +162,7 @@ def perform(person: Person, occlusion: Occlusion, frames: int, offsets: tuple[in
 def _controls(
     person: Person, frames: int, start: int, n: int, rng: np.random.Generator
 ) -> tuple[Array, NDArray[np.str_], Mask]:
-    """Return the controls and the exercise of every frame, and a weight that is 1 where the jaw is held closed."""
+    """Return the controls and exercise of every frame, and a weight that is 1 in frames with the jaw held closed."""
     exercises = frames - OPEN_HOLD - REST_HOLD
     curves, names = schedule(_EXERCISES, exercises, rng, tempo=1.5)
     still = np.array([_HALF_OPEN, 0.0, 0.0])
@@ -271,7 +271,8 @@ def _arch_surfaces(arch: DentalArch) -> tuple[Surface, Surface]:
     for k in np.unique(arch.tooth[:first_gum]):
         own = arch.tooth[:first_gum] == k
         height = np.abs(vertices[:first_gum][own, 1])
-        share = (height - height.min()) / np.ptp(height)  # distance from the occlusal end relative to crown height
+        # distance from the occlusal end as a fraction of the crown height
+        share = (height - height.min()) / np.ptp(height)
         colors[own] *= 1.0 - 0.16 * share[:, None] * np.array([0.6, 0.8, 1.3])
         if abs(k) == 3:
             colors[own] *= _CANINE_TINT

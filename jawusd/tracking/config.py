@@ -85,8 +85,8 @@ class TrackingConfig:
     tile_factor: float = 2.2
     # Number of recent good frames that define the usual residual and coverage: about a second.
     history_frames: int = 31
-    # Number of recent good frames that define the usual score: fewer frames than lips take to close, and more than the
-    # loss of a pose takes.
+    # Number of recent good frames that define the usual score: fewer frames than lips need to close, and more than it
+    # takes to lose a pose.
     score_frames: int = 7
     # Fraction of the recent median score below which the pose of an arch is suspect [-]: closing lips seldom hide so
     # much of an arch in a few frames.
@@ -133,9 +133,10 @@ class TrackingConfig:
     # Delay above which delays are corrected before camera poses are tested [frames]: larger than that between
     # free-running cameras.
     late_frames: float = 0.6
-    # Maximum number of rounds in which all frames are aligned again: each round leaves a tenth of the delay.
+    # Maximum number of rounds in which all frames are aligned again: each round reduces the remaining delay to a tenth.
     refine_rounds: int = 2
-    # Maximum number of such rounds while a camera still has a delay, since matches then converge slowly.
+    # Maximum number of rounds of aligning all frames again while a camera still has a delay, since matches then
+    # converge slowly.
     late_rounds: int = 4
     # Contour shift due to wrong camera poses above which camera poses are corrected [px]: smaller shifts are due to
     # annotator bias.
@@ -151,7 +152,7 @@ class TrackingConfig:
     settled_share: float = 0.2
 
     def gates_after(self, gates_px: tuple[float, ...], moved_mm: float) -> tuple[float, ...]:
-        """Return the remaining residual gates after a step with the first gate that moved the arches by `moved_mm`."""
+        """Return the residual gates that remain after a first step, which moved the arches by `moved_mm`."""
         rest = gates_px[1:]
         if rest and gates_px[0] == rest[-1]:
             return () if moved_mm < self.converged_mm else rest

@@ -109,7 +109,7 @@ def meshes_of(mandible: bpy.types.Object) -> list[bpy.types.Object]:
 
 
 def rig_of(actor: bpy.types.Object) -> vendored.JawRig:
-    """Return the evaluator of an actor, cached by the text of the rig stored in the actor.
+    """Return the evaluator of an actor; it is cached under the text of the rig that is stored in the actor.
 
     Raises:
         vendored.JawusdError: The rig was stored by an older version of the add-on.

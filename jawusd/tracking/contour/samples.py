@@ -220,7 +220,7 @@ def _visible(
     px_per_mm: float,
     facing_gum: Array,
 ) -> Array:
-    """Keep samples with their own surface just inside and no crown just outside; classify free edge and gum line."""
+    """Keep samples with their surface just inside and no crown just outside; classify them as free edge or gum line."""
     out = np.empty_like(samples)
     height, width = labels.shape
     shows_gum = facing_gum[0] == 0.0 and facing_gum[1] == 0.0

@@ -84,7 +84,7 @@ class _Aligned:
 
 
 def _aligned(solver: ContourSolver, config: TrackingConfig, start: Array, views: Sequence[View], use: Mask) -> _Aligned:
-    """Align both arches with narrow and with wide residual gates, then exclude masks that they do not cover."""
+    """Align both arches with narrow and with wide residual gates, then exclude masks that the scans do not cover."""
     whole = use
     best = solver.solve(start, views, config.gates_from(0.0), use)
     wide = solver.solve(start, views, config.wide_gates_px, use)

@@ -22,7 +22,8 @@ _CELL_MM = 1.0
 _THROUGH_MM = 2.0  # minimum vertical overlap of arches that passed through one another [mm]; cusps overlap less
 _SLAB_MM = 3.0
 _FEWEST = 50  # minimum number of surface samples for a side of an arch to be measured
-# minimum distance from the midline for a point to count as left or right: nearer ones may be on the central incisors
+# minimum distance from the midline for a crown point to count as left or right: nearer points may be on the central
+# incisors
 _ASIDE_MM = 6.0
 _OPEN = 0.08  # minimum ratio of vector area to area for a surface to count as open [-]
 # Limits for the gum to indicate the orientation of a scan: minimum area relative to the crowns [-], and minimum

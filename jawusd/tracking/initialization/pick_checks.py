@@ -41,8 +41,8 @@ _ALIKE = 0.15  # maximum difference of another mistake's misfit from the smalles
 _MOST_TRIED = 400
 _FEWEST = 3  # minimum number of picks on an arch
 
-#: Function that returns the mask pixels of both arches in the frame of the picks, shape (N, 2) each, N = 0 if no mask.
-#: Arguments: name of the camera whose masks are read, and name of the camera whose frame numbers are used.
+#: Function that returns the mask pixels of both arches in the frame of the picks, shape (N, 2) each, N = 0 without a
+#: mask. Arguments: name of the camera whose masks are read, and name of the camera whose frame numbers are used.
 Seen = Callable[[str, str], tuple[Array, Array]]
 
 

@@ -16,7 +16,8 @@ from jawusd.tracking.initialization.occlusion import Occlusion, measure_occlusio
 
 # The limits lie outside the range of all valid bites measured (docs/explanation/constants.md). Limits beyond which a
 # bite is impossible: distance between the arches, fraction of the bite in which the arches interpenetrate, fraction of
-# coinciding surface, minimum opposed fraction, rotation about the bite normal, maximum and minimum width.
+# coinciding surface, minimum fraction of opposed crown surface, rotation about the bite normal, maximum and minimum
+# width of an arch.
 _APART_MM = 4.0
 _THROUGH_SHARE = 0.5
 _SAME_SHARE = 0.5

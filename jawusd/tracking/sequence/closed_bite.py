@@ -35,7 +35,7 @@ _LONGEST_REST = 24  # maximum number of rest frames used on either side; more wo
 
 @dataclass(frozen=True, eq=False)
 class RestFrames:
-    """Frames with closed teeth, and whether to correct the lower scan by them.
+    """Frames with closed teeth, and whether they are used to correct the position of the lower scan.
 
     Attributes:
         frames: frame numbers.
@@ -130,7 +130,7 @@ class ClosedBite:
     remaining: Array
 
     def correct(self, poses: Array, registered: bool) -> Array:
-        """Return poses (F, 2, 4, 4) without constant errors; if `registered`, of the lower scan moved by `motion`."""
+        """Return poses (F, 2, 4, 4) without constant errors; if `registered`, for the lower scan moved by `motion`."""
         out = poses @ se3_inverse(self.steady_motions(False))
         if registered:
             out[:, 1] = out[:, 1] @ se3_inverse(self.motion())

@@ -113,7 +113,7 @@ class GuidedTracker:
             history.add_summary(before)
         tracker = FrameTracker(self._solver, self._config, history)
         for frame in frames:
-            self._solver.forget_drawings()  # so that resumed runs have the same poses as uninterrupted ones
+            self._solver.forget_drawings()  # makes the poses of resumed runs the same as those of uninterrupted runs
             start = guide[frame]
             record = tracker.track([start], self._see(frame, start, 0), None)
             for turn in range(1, self._rounds):

@@ -142,7 +142,7 @@ class SearchBudget:
 
 
 class _Partial(NamedTuple):
-    """Quality of frames in which a camera is missing; used if there are no complete frames."""
+    """Quality of frames in which a camera is missing; used if no frame has all cameras."""
 
     scores: deque[Array]
     residuals: deque[Array]

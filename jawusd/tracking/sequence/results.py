@@ -123,7 +123,7 @@ def _columns(records: Mapping[int, FrameRecord], frames: NDArray[np.int64]) -> l
 
 
 def _figures(record: FrameRecord) -> tuple[Array | Mask | NDArray[np.int8], ...]:
-    """Return the values of a frame that are stored in tracks; the third has reason, value and limit of each loss."""
+    """Return the values of a frame that are stored in tracks; the third lists reason, value and limit of each loss."""
     solution, losses = record.solution, np.array(record.losses, np.float64)
     quality = (residual_px(solution), matched_px(solution))
     return (solution.poses, record.status, losses, solution.centres, record.coverage, record.used, *quality)

@@ -142,7 +142,7 @@ def combine(tracks: Tracks, poses: Array, covariance: Array, landmarks: Array) -
 
 
 def _weighted(one: Array, one_covariance: Array, other: Array, other_covariance: Array) -> tuple[Array, Array]:
-    """Return weighted means of poses (F, 4, 4), and covariances (F, 6, 6); where `one` is missing, return `other`."""
+    """Return weighted means of poses (F, 4, 4) and covariances (F, 6, 6); use `other` where `one` is missing."""
     known, also = (
         np.isfinite(pose).all((1, 2)) & np.isfinite(covariance).all((1, 2))
         for pose, covariance in ((one, one_covariance), (other, other_covariance))

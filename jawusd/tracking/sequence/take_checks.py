@@ -1,4 +1,4 @@
-"""Findings about the inputs of a tracked take (calibration, scans, masks, cameras), and about searches left out.
+"""Findings about the inputs of a tracked take (calibration, scans, masks, cameras), and about skipped searches.
 
 False-alarm rates come from `tests/benchmarks/population.py`; docs/explanation/constants.md lists them.
 """
