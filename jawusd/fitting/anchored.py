@@ -52,14 +52,10 @@ _CV_CAP_MM = 1.0
 _TAIL_RIDGE = 1e-6  # penalty that keeps the linear coefficients finite along a direction without motion
 _FRAMES_PER_CENTRE = 4
 _TRIM_FLOOR_MM = 0.5
-_GUIDED_GRID = (
-    9,
-    7,
-    7,
-)  # numbers of grid points (opening, sideways, forward) at which poses are predicted from the condylar paths
-_GUIDED_SHARE = (
-    0.08  # total weight of the predictions from condylar paths relative to that of the frames, for paths without misfit
-)
+# Numbers of grid points (opening, sideways, forward) at which poses are predicted from the condylar paths.
+_GUIDED_GRID = (9, 7, 7)
+# Total weight of the predictions from condylar paths relative to that of the frames, for paths without misfit.
+_GUIDED_SHARE = 0.08
 
 
 @dataclass(frozen=True)
