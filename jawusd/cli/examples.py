@@ -32,7 +32,6 @@ EXAMPLES = {
         "jawusd retarget --landmarks face.json --library people -o model.npz",
     ),
     "solve": (
-        "jawusd solve out shot -o take.usdc",
         "jawusd solve out shot -o take.npz --overlay take.mp4 --report take.html",
         "jawusd solve out shot --skin skin.npz --face face.csv -o take.npz",
     ),
@@ -45,7 +44,7 @@ EXAMPLES = {
         "jawusd skin-fit out take.npz face.csv -o skin.npz --bite 1200-1260",
         "jawusd skin-fit out take.npz markers.c3d --rigid head=HL,HR,HF --rest-frame 0",
     ),
-    "view": ("jawusd view out", "jawusd view capture --tracks out", "jawusd view out --page jaw.html"),
+    "view": ("jawusd view capture --tracks out", "jawusd view out --page jaw.html"),
     "info": ("jawusd info out", "jawusd info out/tracks.npz --frame 120"),
     "report": ("jawusd report out", "jawusd report out --experiments"),
     "validate": ("jawusd validate out", "jawusd validate out --face jaw.npz --align T_skull_model.json"),
