@@ -51,7 +51,7 @@ def files(tmp_path_factory, actor):
     (folder / "broken" / "scans" / "upper_teeth.ply").write_bytes(b"ply\n")
     (folder / "footage").mkdir()
     (folder / "footage" / "left.mp4").write_bytes(b"x")
-    (folder / "list.txt").write_text("capture\n")
+    (folder / "list.txt").write_text("broken\n")
     (folder / "line.png").write_bytes(b"x")
     d = np.stack([np.linspace(0, 12, 40), np.zeros(40), np.zeros(40)], axis=1)
     write_parameters(folder / "d.csv", np.arange(40), d)
@@ -79,6 +79,10 @@ def test_no_name_of_a_folder_ends_a_command_in_a_traceback(files, tmp_path, name
         shutil.copytree(os.fsencode(files), place)
     except OSError as error:
         pytest.skip(f"no such names here: {error}")
+    whole = name == "signs" and locale == "UTF-8"  # a build of all stages; a name that they take, others take
+    if whole:
+        with open(os.path.join(place, b"list.txt"), "w") as captures:
+            captures.write("capture\n")
     folder = b"./" + NAMES[name] if NAMES[name].startswith(b"-") else NAMES[name]
     driver = ROOT / "tests" / "support" / "names_driver.py"
     environment = {**os.environ, **LOCALES[locale], "PYTHONPATH": str(ROOT)}
