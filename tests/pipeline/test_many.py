@@ -15,7 +15,7 @@ import psutil
 import pytest
 from distributed import LocalCluster
 from package_copy import ROOT
-from run_jawusd import heed_signals
+from run_jawusd import heed_signals, without_report
 from short_example import results, write_short
 from typer.testing import CliRunner
 
@@ -42,6 +42,7 @@ def started(folder, *arguments):
     """Start the program on the list of a folder, in a new process group as in a terminal."""
     command = [sys.executable, "-m", "jawusd", "build-many", str(folder / "list.txt"), "-o", str(folder / "out")]
     how = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, "start_new_session": True}
+    how["env"] = without_report(folder / "hidden")
     return subprocess.Popen([*command, *arguments], **how, preexec_fn=heed_signals)
 
 
