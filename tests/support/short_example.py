@@ -27,9 +27,8 @@ def write_short(folder: Path, frames: int, without: tuple[str, ...] = ()) -> Pat
             if source.is_file():
                 _link(source, target)
     _link(EXAMPLE / "calibration.toml", folder / "calibration.toml")
-    text = (EXAMPLE / "capture.toml").read_text()
-    text = re.sub(r"frames = \[20, \d+\]", f"frames = [20, {20 + frames}]", text)
-    text = re.sub(r'(?m)^video = .*\n|^\[boards\]\n(?:\w+ = .*\n)+|^method = "flash"\n', "", text)
+    text = shortened((EXAMPLE / "capture.toml").read_text(), frames)
+    text = re.sub(r'(?m)^method = "flash"\n', "", text)
     for name in without:
         text = re.sub(rf'(?m)^{name} = "scans/.*\n', "", text)
     with np.load(EXAMPLE / "truth" / "truth.npz") as truth:
@@ -38,6 +37,12 @@ def write_short(folder: Path, frames: int, without: tuple[str, ...] = ()) -> Pat
     text = text.replace("[sync]\n", f"[sync]\noffsets = {{ {given} }}\n")
     (folder / "capture.toml").write_text(text)
     return folder
+
+
+def shortened(text: str, frames: int) -> str:
+    """Return the text of the example's capture.toml with its first frames, without clips and boards."""
+    text = re.sub(r"frames = \[20, \d+\]", f"frames = [20, {20 + frames}]", text)
+    return re.sub(r"(?m)^video = .*\n|^\[boards\]\n(?:\w+ = .*\n)+", "", text)
 
 
 def _link(source: Path, target: Path) -> None:
