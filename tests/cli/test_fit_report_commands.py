@@ -1,13 +1,12 @@
-"""`jawusd fit` with poses and anatomy of other programs, and `jawusd report`, run as programs."""
+"""`jawusd fit` with poses and anatomy of other programs, and `jawusd report`."""
 
 import json
 import re
-import subprocess
-import sys
 
 import h5py
 import numpy as np
 import pytest
+import run_jawusd
 from package_copy import ROOT
 from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
@@ -27,12 +26,9 @@ SCANS = EXAMPLE / "scans"
 
 
 def run(*arguments, code=0):
-    """Run the program in a new process; return its standard output, or its error message."""
-    command = [sys.executable, "-m", "jawusd", *map(str, arguments)]
-    result = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
-    assert result.returncode == code, result.stdout + result.stderr
-    assert "Traceback" not in result.stderr
-    return result.stdout if code == 0 else " ".join(result.stderr.replace("│", " ").split())
+    """Run the program; return its standard output, or its error message in one line."""
+    told = run_jawusd.run(*arguments, code=code)
+    return told if code == 0 else " ".join(told.replace("│", " ").split())
 
 
 @pytest.fixture(scope="module")
