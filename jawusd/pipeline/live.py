@@ -238,8 +238,10 @@ class _Follower:
         Raises:
             TrackingError: the teeth were not found.
         """
-        shot = VideoShot(self._capture, self._cameras, self._offsets, self._teeth, self._jaw, VideoOptions())
-        begin = shot.begin(no_progress)
+        shot = VideoShot(
+            self._capture, self._cameras, self._offsets, self._teeth, self._jaw, VideoOptions(), no_progress
+        )
+        begin = shot.begin()
         after = range(begin.frame, min(begin.frame + _BEFORE, shot.footage.range()[1]))
         for frame, pictures in shot.footage.walk(after):
             if frame == begin.frame:

@@ -93,6 +93,8 @@ class PictureSearch(Generic[T]):
         one camera orientation is tried and, with several cameras, the first start that fits is returned, because it
         can be compared with those frames. Otherwise, four orientations are tried.
 
+        Progress is reported for frames searched and for starts tried.
+
         Raises:
             TrackingError: no start fits.
             CaptureError: an image cannot be decoded.
@@ -108,9 +110,11 @@ class PictureSearch(Generic[T]):
             seen += len(part)
             for turns, count in zip(hypotheses, _TRIED, strict=False):
                 candidates = self._candidates(part, turns, progress)
-                for candidate in sorted(candidates, key=lambda candidate: candidate.bridged)[:count]:
+                candidates = sorted(candidates, key=lambda candidate: candidate.bridged)[:count]
+                for done, candidate in enumerate(candidates, start=1):
                     tried.append(candidate.frame)
                     found = self._at(candidate)
+                    progress("try starts", done, len(candidates))
                     if found is not None and (best is None or found.fit > best.fit):
                         best = found
                     if best is not None and best.fit >= clear:
@@ -132,7 +136,7 @@ class PictureSearch(Generic[T]):
             apart = arches_apart(pictures, turns)
             if len(apart) >= min(2, len(self.cameras)):
                 out.append(_Candidate(frame, apart))
-            progress("start", done, len(chosen))
+            progress("search", done, len(chosen))
         return out
 
     def _at(self, candidate: _Candidate) -> Start[T] | None:

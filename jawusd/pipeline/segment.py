@@ -7,6 +7,7 @@ import json
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -155,7 +156,8 @@ class _Segmentation:
         """Follow the teeth through all frames by their colours, starting from the poses in one frame."""
         follower = Follower(self._footage, self._cameras, self._tracker.scans, self._subject, self._pool)
         follower.start_at(start, poses)
-        self._guide = follower.run(range(self._first, self._stop), self._search(follower).again, self._progress)
+        find = partial(self._search(follower).run, progress=self._progress)
+        self._guide = follower.run(range(self._first, self._stop), find, self._progress)
         save_guide(self._folder, self._guide_inputs, self._guide)
 
     def _find_start(self) -> tuple[int, Array]:

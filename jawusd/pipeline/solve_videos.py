@@ -18,7 +18,7 @@ from jawusd.geometry import Camera
 from jawusd.pipeline.cameras import open_videos
 from jawusd.pipeline.follow import Cutter
 from jawusd.pipeline.picture_search import LEAST_FIT, PictureSearch, Start, picked_start
-from jawusd.pipeline.state import Progress, no_progress
+from jawusd.pipeline.state import Progress
 from jawusd.pipeline.subject import subject_of_capture
 
 if TYPE_CHECKING:
@@ -102,6 +102,7 @@ class VideoShot:
         teeth: PreparedTeeth,
         jaw: JawRig,
         options: VideoOptions,
+        progress: Progress,
     ) -> None:
         """Open the videos of calibrated cameras, by name.
 
@@ -112,7 +113,7 @@ class VideoShot:
         from jawusd.tracking.region.performance import PictureShot, PictureTake
 
         videos = open_videos(capture)
-        self._capture, self._offsets, self._teeth = capture, offsets, teeth
+        self._capture, self._offsets, self._teeth, self._progress = capture, offsets, teeth, progress
         self.cameras = {name: camera for name, camera in cameras.items() if name in videos}
         self.footage = ColourFootage(videos, offsets)
         shot = PictureShot(
@@ -132,7 +133,7 @@ class VideoShot:
         table = {camera.name: camera for camera in placed}
         return Cutter(table, self._teeth.scans, centre).walk(self.footage, frames)
 
-    def begin(self, progress: Progress) -> Start[Pose]:
+    def begin(self) -> Start[Pose]:
         """Return a start, from picks in at least two cameras or from a frame in which the arches are visibly apart.
 
         Raises:
@@ -141,21 +142,21 @@ class VideoShot:
         """
         if self._capture.bootstrap is not None and len(self.cameras) > 1:
             return self._picked(self._capture.bootstrap)
-        return self._searched(self._frames, progress)
+        return self._searched(self._frames)
 
     def _again(self, frames: range, up_world: Array) -> tuple[int, Pose]:
         """Search in frames in which the teeth were lost; `up_world` is as in `PictureSearch.run`."""
-        begin = self._searched(frames, no_progress, up_world)
+        begin = self._searched(frames, up_world)
         return begin.frame, begin.pose
 
-    def _searched(self, frames: range, progress: Progress, up_world: Array | None = None) -> Start[Pose]:
+    def _searched(self, frames: range, up_world: Array | None = None) -> Start[Pose]:
         """Return a start of tracking within a range of frames; see `PictureSearch.run`."""
 
         def near(sources: Sequence[CameraSource], frame: int) -> Pose | None:
             return self._teeth.search.at(sources, self.cameras, self._offsets, frame)
 
         search = PictureSearch(self._capture, self.footage, self.cameras, near, self.take.begun)
-        return search.run(frames, progress, up_world)
+        return search.run(frames, self._progress, up_world)
 
     def _picked(self, bootstrap: Bootstrap) -> Start[Pose]:
         """Return a start of tracking from the picks."""
@@ -184,8 +185,8 @@ def solve_videos(
     """
     with ThreadPoolExecutor(options.jobs) as pool:
         teeth = PreparedTeeth(capture, meshes, jaw, pool.map)
-        shot = VideoShot(capture, cameras, offsets, teeth, jaw, options)
-        begin = shot.begin(progress)
+        shot = VideoShot(capture, cameras, offsets, teeth, jaw, options, progress)
+        begin = shot.begin()
         found = shot.take.solve(begin.frame, begin.pose, partial(progress, "solve"))
     found.notes["start"] = {"by": begin.by, "frame": begin.frame, "fit": begin.fit}
     found.notes["findings"] = [finding.as_json() for finding in teeth.search.findings]

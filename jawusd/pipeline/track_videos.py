@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING
 
 from jawusd.base.arrays import Array
@@ -15,7 +16,7 @@ from jawusd.formats.tracks import Tracks
 from jawusd.pipeline.cameras import open_footage
 from jawusd.pipeline.follow import Follower
 from jawusd.pipeline.picture_search import PictureSearch, Start, picked_start
-from jawusd.pipeline.state import Progress, no_progress
+from jawusd.pipeline.state import Progress
 from jawusd.pipeline.subject import subject_of_capture
 
 if TYPE_CHECKING:
@@ -66,7 +67,7 @@ def track_videos(
         picks = capture.bootstrap
         search = ArchSearch(capture, offsets, footage, rows, follower)
         begin = search.run(frames, None, progress) if picks is None else _picked_start(rows, follower, picks, frames)
-        followed = follower.run(frames, search.again, progress)
+        followed = follower.run(frames, partial(search.run, progress=progress), progress)
     facts = TakeFacts(
         tuple(cameras.values()),
         scans,
@@ -135,7 +136,3 @@ class ArchSearch:
         # Start again: the search may have tried other starts after this one.
         self.follower.start_at(begin.frame, begin.pose)
         return begin
-
-    def again(self, frames: range, up_world: Array) -> Start[Array]:
-        """Search in frames in which the teeth were lost; see `run`."""
-        return self.run(frames, up_world, no_progress)

@@ -49,7 +49,7 @@ def searched(monkeypatch):
     monkeypatch.setattr("jawusd.segmentation.rows.tooth_rows", rows)
     monkeypatch.setattr(picture_search, "masked_cameras", lambda *given: [])
 
-    def run(fit_of, upright=0):
+    def run(fit_of, upright=0, progress=no_progress):
         UPRIGHT["turns"] = upright
         footage, tried = _Footage(), []
 
@@ -59,7 +59,7 @@ def searched(monkeypatch):
 
         search = PictureSearch(None, footage, CAMERAS, near, lambda frame, pose: (pose, fit_of(frame)))
         try:
-            return search.run(TAKE, no_progress), tried, footage
+            return search.run(TAKE, progress), tried, footage
         except TrackingError as error:
             return error.message, tried, footage
 
@@ -80,6 +80,14 @@ def test_the_best_poor_fit_is_told(searched):
 def test_teeth_in_a_later_part_are_found(searched):
     begin, tried, _ = searched(lambda frame: 0.9 if frame > 900 else None)
     assert begin.frame > 900 and begin.pose == "pose" and len(tried) < 24
+
+
+def test_frames_looked_at_and_starts_tried_are_reported(searched):
+    steps = []
+    _, tried, _ = searched(lambda frame: 0.9 if frame == 26 else None, progress=lambda *step: steps.append(step))
+    assert steps[:2] == [("search", 1, 30), ("search", 2, 30)]
+    assert [step for step in steps if step[0] == "try starts"] == [("try starts", k, 4) for k in (1, 2, 3)]
+    assert tried == [10, 18, 26]
 
 
 @pytest.mark.parametrize("upright", [1, 2, 3])
