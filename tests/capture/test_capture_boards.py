@@ -199,7 +199,7 @@ def test_pictures_without_a_board_are_refused(tmp_path):
     rng = np.random.default_rng(1)
     images = [[rng.integers(80, 120, (480, 640)).astype(np.uint8) for _ in range(2)] for _ in CAMERAS]
     videos = write_pictures(tmp_path, images)
-    with pytest.raises(CalibrationError, match="camera c0: no chessboard with 9 x 6 inner corners in any of 2"):
+    with pytest.raises(CalibrationError, match="c0: no chessboard with 9 x 6 inner corners was found in any of 2"):
         find_boards(NAMES, board(videos=videos), quiet)
     about = {"pattern": "charuco", "dictionary": "DICT_4X4_50", "marker_mm": 3.0}
     with pytest.raises(CalibrationError, match="no charuco of DICT_4X4_50"):

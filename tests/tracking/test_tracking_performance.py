@@ -169,7 +169,7 @@ def test_a_wrong_mask_in_one_of_three_cameras_costs_no_frame(jaw, scans, truth, 
 def test_skin_measures_the_jaw_while_one_camera_sees_no_teeth(jaw, scans, truth, tmp_path):
     """Skin with an unknown offset, and two frames with a strange face; half of the frames show no teeth."""
     hidden, strange = np.arange(6, 20), np.array([11, 12])
-    write_masks(tmp_path, jaw, truth, small_take.CAMERAS[:1], hidden)
+    write_masks(tmp_path, jaw, truth, small_take.CAMERAS[:1], hidden=hidden)
     measured = truth[0] + [0.5, -0.2, 0.2] + np.random.default_rng(6).normal(0, 0.2, (COUNT, 3))
     measured[strange] += 30.0
     familiar = ~np.isin(np.arange(COUNT), strange)
