@@ -77,7 +77,7 @@ def test_the_package_offers_its_names_and_loads_them_when_used():
     )
     done = run(code)
     assert done.stdout.splitlines() == [
-        "JawRig JawusdError __version__ build fit_skin load load_skin save_skin track",
+        "JawRig JawusdError __version__ align build fit_skin load load_skin save_skin track",
         "jawusd.base jawusd.base.plugin_path jawusd.base.version False",
         "JawRig JawusdError False",
     ], done.stderr
