@@ -66,9 +66,9 @@ class Outlines:
 
 
 def split_teeth(scan: Scan, T_anatomical_scan: Array, arch: int) -> Crowns:
-    """Return the crowns of a scan as connected pieces, with a substitute gum wall if the scan has no gum.
+    """Return the crowns of a scan as connected pieces, with a substitute gum surface if the scan has no gum.
 
-    Without the wall, teeth on the far side would be rendered where the gum hides them in reality.
+    This surface occludes teeth on the far side of the arch in renderings, as gum does in photographs.
 
     Args:
         scan: one arch.

@@ -20,6 +20,7 @@ from jawusd.tracking.performance.system import TakeSystem
 from jawusd.tracking.performance.unknowns import Unknowns
 
 COUNT = 7
+BORDERS = AnnotatorPrior(common=(0.0, 0.0, 0.0), arch=(0.4, 0.08, 0.02), camera=(0.0, 0.0), frames=5.0)
 
 
 @pytest.fixture(scope="module")
@@ -106,7 +107,8 @@ def inside_by(bias_px, jaw, frames, annotator):
 def test_many_frames_reveal_a_bias_as_far_as_the_prior_allows(jaw):
     """Masks of a take share errors, so the bias is estimated as from a few frames, and only within its prior."""
     narrow = replace(DRAWN, common=(0.1, 0.1, 0.05), arch=(0.1, 0.1, 0.05))
-    np.testing.assert_allclose(inside_by(-0.5, jaw, 40, DRAWN), -0.5, atol=0.2)
+    np.testing.assert_allclose(inside_by(-0.5, jaw, 40, DRAWN), -0.5, atol=0.1)
+    np.testing.assert_allclose(inside_by(-0.5, jaw, 40, BORDERS), -0.5, atol=0.1)
     assert (inside_by(-0.5, jaw, 40, narrow) > -0.3).all()
     many = replace(narrow, frames=40.0)
     np.testing.assert_allclose(inside_by(-0.5, jaw, 40, many), -0.5, atol=0.1)
@@ -115,8 +117,7 @@ def test_many_frames_reveal_a_bias_as_far_as_the_prior_allows(jaw):
 def test_layers_without_variance_are_no_unknowns(jaw):
     """The borders of colours have one bias per arch, which all cameras share."""
     scan = SimpleNamespace(centre=np.array([0.0, 4.0, -9.0]))
-    borders = AnnotatorPrior(common=(0.0, 0.0, 0.0), arch=(0.4, 0.08, 0.02), camera=(0.0, 0.0), frames=5.0)
-    unknowns = Unknowns(Coordinates(jaw, (scan, scan)), 4, 3, annotator=borders)
+    unknowns = Unknowns(Coordinates(jaw, (scan, scan)), 4, 3, annotator=BORDERS)
     poses = [Pose(np.eye(4), np.zeros(3))] * 4
     _, state = unknowns.moved(poses, unknowns.start(), np.zeros((4, LOCAL)), np.arange(1.0, 7.0))
     assert unknowns.shared == 6

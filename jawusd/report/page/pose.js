@@ -215,11 +215,7 @@
     setRunning(false);
     show([0, 0, 0]);
   });
-  for (const button of box.querySelectorAll("[data-view]"))
-    button.addEventListener("click", () => {
-      scene?.look(button.dataset.view);
-      draw();
-    });
+  connectView(box, canvas, scene, draw);
   canvas.addEventListener("pointerdown", (event) => {
     setRunning(false);
     held = { at: [event.clientX, event.clientY], point: grab(event), start: now };
@@ -241,12 +237,6 @@
     show(drag(now, held.point, along.map((x, i) => eye[i] + far * x), right, up, sight));
   });
   for (const name of ["pointerup", "pointercancel"]) canvas.addEventListener(name, () => (held = null));
-  canvas.addEventListener("wheel", (event) => {
-    event.preventDefault();
-    scene?.zoom(event.deltaY);
-    draw();
-  }, { passive: false });
-  addEventListener("resize", draw);
   scene?.look("front");
   show([0, 0, 0]);
   setRunning(!matchMedia("(prefers-reduced-motion: reduce)").matches);

@@ -43,7 +43,6 @@
     return [0, 1, 2].map((r) => m[r] * p[0] + m[4 + r] * p[1] + m[8 + r] * p[2] + m[12 + r]);
   };
 
-
   const trace = (poses, point) => { // path of a landmark over the last second
     const places = [];
     for (let k = Math.max(0, now - Math.round(data.fps)); k <= now; k++)
@@ -87,11 +86,7 @@
     show(Number(slider.value));
   });
   source.addEventListener("change", draw);
-  for (const button of box.querySelectorAll("[data-view]"))
-    button.addEventListener("click", () => {
-      scene?.look(button.dataset.view);
-      draw();
-    });
+  connectView(box, canvas, scene, draw);
   let held = null;
   canvas.addEventListener("pointerdown", (event) => {
     held = [event.clientX, event.clientY];
@@ -104,11 +99,6 @@
     draw();
   });
   for (const name of ["pointerup", "pointercancel"]) canvas.addEventListener(name, () => (held = null));
-  canvas.addEventListener("wheel", (event) => {
-    event.preventDefault();
-    scene?.zoom(event.deltaY);
-    draw();
-  }, { passive: false });
   for (const button of document.querySelectorAll("[data-frame]"))
     button.addEventListener("click", () => {
       const index = frames.indexOf(Number(button.dataset.frame));
@@ -117,6 +107,5 @@
       show(index);
       box.scrollIntoView({ behavior: "smooth", block: "center" });
     });
-  addEventListener("resize", draw);
   show(0);
 })();

@@ -144,7 +144,6 @@ const makeScene = (canvas, data) => {
     gl.depthMask(true);
   };
 
-
   // -- view ----------------------------------------------------------------------------------------------------------
   const look = (name) => { [turn, tilt] = views[name]; };
   const orbit = (dx, dy) => { // movement of the pointer [px]
@@ -154,4 +153,19 @@ const makeScene = (canvas, data) => {
   const zoom = (step) => { away = Math.min(Math.max(away * Math.exp(step / 600), data.radius), data.radius * 10); };
   setUp();
   return { draw, look, orbit, zoom, parts, identity, camera: () => camera(canvas.clientWidth / Math.max(canvas.clientHeight, 1)) };
+};
+
+// Connect the view buttons, the wheel and the size of the window to a scene; `draw` draws it again.
+const connectView = (box, canvas, scene, draw) => {
+  for (const button of box.querySelectorAll("[data-view]"))
+    button.addEventListener("click", () => {
+      scene?.look(button.dataset.view);
+      draw();
+    });
+  canvas.addEventListener("wheel", (event) => {
+    event.preventDefault();
+    scene?.zoom(event.deltaY);
+    draw();
+  }, { passive: false });
+  addEventListener("resize", draw);
 };
