@@ -31,7 +31,7 @@ SETTING = "JAWUSD_MEMORY_GB"
 _FRACTION, _MIN_GB = 0.75, 4.0  # default limit: fraction of the memory, and minimum for usual builds
 _MIN_SPACE_GB = 1.5  # minimum accepted address space; OpenUSD's libraries take 1.3 GB
 _CHILD = "_JAWUSD_CHILD"  # environment variable set in the child on systems without fork
-_SI_KERNEL = 0x80  # si_code in Linux's siginfo.h: sent by the terminal, which signals the child as well
+_SI_KERNEL = 0x80  # si_code (siginfo.h) of a signal from the terminal, which also goes to the child
 _PR_SET_PDEATHSIG = 1  # from Linux's prctl.h
 _PASSED = ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGUSR1", "SIGUSR2", "SIGTSTP", "SIGCONT")
 _KEYS = ("SIGINT", "SIGQUIT", "SIGTSTP")
@@ -111,7 +111,7 @@ def limit_process(memory: int, cpu_s: int | None = None) -> None:
     Args:
         memory: Maximum memory [bytes]; 0 for no limit. Private writable memory counts, but not address space that CUDA,
             numba and threads only reserve.
-        cpu_s: Processor time [s].
+        cpu_s: Maximum processor time [s].
     """
     if resource is None:
         return
@@ -211,7 +211,7 @@ def _next_signal(awaited: set[signal.Signals]) -> tuple[int, bool]:
 
 
 def _exit_like(status: int) -> NoReturn:
-    """End this process like its child: with its exit code, by its signal, or with a message if it crashed."""
+    """End this process as its child ended: with the same exit code or signal, or with a message after a crash."""
     if os.WIFEXITED(status):
         os._exit(os.WEXITSTATUS(status))
     number = signal.Signals(os.WTERMSIG(status))
@@ -253,7 +253,7 @@ def _run_in_subprocess() -> NoReturn:
 
 
 _M_MMAP_THRESHOLD = -3  # parameter of mallopt, from glibc's malloc.h
-# size [bytes] above which glibc maps arrays; mapping is slow: with 1 MB, a report takes 10 % longer
+# size [bytes] above which glibc maps arrays; mapping is slow, so a limit of 1 MB makes a report take 10 % longer
 _LARGE_BYTES = 8_000_000
 
 

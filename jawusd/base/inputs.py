@@ -28,7 +28,7 @@ def check_input(path: str | os.PathLike[str], error: type[JawusdError] = FormatE
         JawusdError: the path is a folder, a named pipe, a device or a socket; raised as an instance of `error`.
     """
     note_input(path)
-    there = Path(os.path.realpath(path))  # for an anonymous pipe "pipe:[1234]", a path that does not exist
+    there = Path(os.path.realpath(path))  # an anonymous pipe becomes "pipe:[1234]", a path that does not exist
     try:
         wrong = there.exists() and not there.is_file()
     except OSError:  # the name is too long; the reader reports it
@@ -62,7 +62,7 @@ def check_path(path: str | os.PathLike[str], error: type[JawusdError]) -> None:
         )
     try:
         os.path.abspath(path).encode()
-    except UnicodeEncodeError:  # Python represents such bytes as lone surrogates
+    except UnicodeEncodeError:  # Python represents undecodable bytes as lone surrogates
         raise error(
             "the path is not UTF-8, or has characters that this locale lacks; OpenUSD cannot open it.",
             path=path,

@@ -50,7 +50,7 @@ def read_text(path: Path, most_bytes: int, encoding: str = "utf-8") -> str:
     try:
         size = path.stat().st_size
         if size > most_bytes:
-            raise FormatError(f"is {size} bytes; at most {most_bytes} are allowed.", path=path)
+            raise FormatError(f"is {size} bytes long; at most {most_bytes} bytes are allowed.", path=path)
         data = path.read_bytes()
     except FileNotFoundError as error:
         raise FormatError("there is no such file.", path=path, hint="Check the path.") from error

@@ -65,7 +65,7 @@ def load_cameras_file(
     Args:
         path: TOML of aniposelib, Pose2Sim or Caliscope; a COLMAP text model (its folder or one of its files);
             nerfstudio's transforms.json; Metashape XML; RealityScan CSV, or (a folder of) XMP; OpenCV YAML, XML or
-                JSON; or 3DEqualizer's Nuke script (or its folder).
+            JSON; or 3DEqualizer's Nuke script (or its folder).
         unit_mm: the file's unit of length [mm].
         sizes: (width, height) [px] of the images by camera, for formats without them; see `lacks_sizes`.
 

@@ -41,7 +41,7 @@ _OTHER_MODELS = re.compile(
 class CameraFormat:
     """Registry entry of a camera format; a module of this package registers its format as FORMAT."""
 
-    # Returns 1 if a path has this format judged by its name, 2 if judged by its content, 0 if not.
+    # Returns 1 if the name of a path indicates this format, 2 if its content does, 0 otherwise.
     reads: Callable[[Path], int]
     # Returns the cameras in the file's order and unit, given (width, height) [px] of the images by camera.
     load: Callable[[Path, Mapping[str, Size]], list[Camera]]
@@ -111,7 +111,7 @@ def check_lens_model(path: Path, where: str, values: Mapping[str, object]) -> No
         said = re.sub(r"[\s-]+", "_", str(value).strip().lower())
         flag = key.lower() in _FLAG_KEYS and said not in ("0", "false", "no", "none", "")
         named = key.lower() in _MODEL_KEYS and said not in _READ_MODELS
-        # "camera_model" may be a product name, so that only known names of other models are rejected
+        # "camera_model" may be a product name, so only known names of other models are rejected
         if flag or (named and (key.lower().startswith("distortion") or _OTHER_MODELS.search(said))):
             raise CalibrationError(
                 f"{where} has {key} = {value}, a lens model that is not supported; use OpenCV's "

@@ -24,7 +24,7 @@ _LENS = 6  # Number of lens parameters per camera: fx, fy, cx, cy, k1, k2.
 _POSE = 6  # Number of pose parameters: rotation vector [rad], translation [mm].
 _HUBER_SIGMAS, _LEAST_SIGMA_PX = 3.0, 0.02
 _MOST_STEPS = 100
-_OUTLIER_SIGMAS, _OUTLIER_PX = 8.0, 1.0  # residual limits; a corner is an outlier if it exceeds both
+_OUTLIER_SIGMAS, _OUTLIER_PX = 8.0, 1.0  # residual limits; a corner is an outlier if its residual exceeds both
 _FEWEST_CORNERS = 6  # minimum number of inlier corners of a view; views with fewer are dropped
 
 
@@ -197,7 +197,7 @@ class _Problem:
         return residual.ravel(), np.asarray(derived, np.float64), turned, carried
 
     def _parts(self, x: Array, turns: Array, slopes: Array, c: int) -> list[tuple[Array | int, Array]]:
-        """Return blocks (2n, 6) of one camera's Jacobian, each with its column offset, common to all rows or per row.
+        """Return blocks (2n, 6) of one camera's Jacobian, each with its column offset, for all rows or per row.
 
         Args:
             turns, slopes: rotations of the boards and their left Jacobians, shape (V, 3, 3).

@@ -72,7 +72,7 @@ def _lens_findings(camera: Camera, path: str) -> Iterator[Finding]:
 
 
 def _fold(camera: Camera) -> float | None:
-    """Return the radius at which the distortion folds over, relative to the image corner's; None if it does not."""
+    """Return the radius where distortion folds over, relative to that of the image corner; None if it does not."""
     width, height = camera.size_px
     corners = np.array([[0, 0], [width - 1, 0], [0, height - 1], [width - 1, height - 1]], np.float64)
     centre = camera.K[:2, 2]

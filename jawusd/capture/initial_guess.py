@@ -21,11 +21,11 @@ from jawusd.base.errors import CalibrationError
 from jawusd.geometry import make_transform, se3_inverse, so3_exp, so3_log
 
 FEWEST_VIEWS = 6  # minimum number of board views per camera; with fewer, focal length and distance are ambiguous
-# Tolerances for equal relative poses: angle, and distance as a fraction.
+# Tolerances within which relative poses count as equal: angle, and relative difference of positions.
 _SAME_ANGLE_RAD, _SAME_SHARE = np.deg2rad(4.0), 0.04
 _LEAST_AGREEMENT = 0.5  # minimum fraction of two cameras' shared views that must agree on the relative pose
 _INTRINSIC_FLAGS = cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST
-_WIDTH_PX = 960  # image width of the search for boards; suffices for boards that fill a fifth of the image
+_WIDTH_PX = 960  # image width for the board search; sufficient for boards that fill a fifth of the image
 _FEWEST_PICTURES = 2  # minimum number of images that must show the same board
 _FEWEST_MARKERS = 4
 _FAMILIES = ("4X4", "5X5", "6X6", "7X7")

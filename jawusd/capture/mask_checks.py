@@ -15,7 +15,7 @@ from jawusd.base.arrays import Array
 from jawusd.formats.finding import Finding
 from jawusd.geometry import Camera, triangulate
 
-#: First and last frame number of a camera with masks, for upper and lower teeth; None if there are no masks.
+#: First and last frame number with masks in a camera, for upper and lower teeth; None if there are no masks.
 Ranges = tuple[tuple[int, int] | None, tuple[int, int] | None]
 #: Centre [px] of the teeth pixels of one video frame, shape (2,), by camera.
 MaskCentres = Mapping[str, Array]

@@ -31,7 +31,7 @@ _ABRUPT_FRAMES = 3  # maximum duration of a light step [frames]
 _TOLERANCE_FRAMES = 1.0  # maximum time difference of matched light steps [frames]
 _DROPPED_S = 0.5  # maximum offset difference at which unmatched light steps indicate dropped frames
 _FEWEST_STEPS = 2
-_BETWEEN_FRAMES = 0.15  # maximum distance from a frame boundary at which a step counts as between two exposures
+_BETWEEN_FRAMES = 0.15  # maximum distance from a frame boundary at which a step counts as lying between two exposures
 RATE_HZ = 16000
 _WHITENING = 0.75
 _LOWEST_HZ = 80.0  # minimum frequency of the sound that is used; excludes mains hum and wind
@@ -46,7 +46,7 @@ class Step:
 
     time_frames: float  # time in frames of the video; the exposure of frame k starts at time k
     rising: bool  # True if the light is switched on, False if it is switched off
-    slack_frames: float = 0.0  # amount by which the step may be earlier because images before it are missing
+    slack_frames: float = 0.0  # duration by which the step may be earlier because images before it are missing
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,7 @@ def find_steps(brightness: Array, first_frame: int = 0) -> list[Step]:
         around = brightness[first:last]
         low, high = around.min(), around.max()
         if high - low < contrast / 2:
-            continue  # skip slow changes, as by clouds, a dimmer or automatic exposure
+            continue  # skip slow changes, as caused by clouds, a dimmer or automatic exposure
         lit = float(((around - low) / (high - low)).sum())
         rising = bool(bright[at])
         steps.append(Step(first_frame + (last - lit if rising else first + lit), rising))
@@ -103,7 +103,8 @@ def match_steps(steps: list[Step], reference: list[Step], fps: float) -> Offset:
     ranked = sorted((_aligned(steps, reference, offset) for offset in candidates), key=lambda a: (-len(a[0]), a[1]))
     if not ranked or len(ranked[0][0]) < _FEWEST_STEPS:
         raise SyncError(
-            f"the light steps at frames {_listed(steps)} do not match those of the reference at {_listed(reference)}."
+            f"the light steps at frames {_listed(steps)} do not match those of the reference camera at "
+            f"{_listed(reference)}."
         )
     pairs, spread, exact = ranked[0]
     _check_dropped_frames(steps, reference, pairs, exact, _DROPPED_S * fps)

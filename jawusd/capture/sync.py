@@ -34,7 +34,7 @@ from jawusd.media.footage import open_clip
 from jawusd.media.video import Video
 
 _FPS_TOLERANCE = 5e-3  # maximum relative difference of equal frame rates; 24 and 23.976 are equal
-_EARLY_S = 2.0  # clips that end more than this before the last clip are reported
+_EARLY_S = 2.0  # time before the end of the last clip; clips that end earlier are reported
 
 
 @dataclass(frozen=True)
@@ -180,7 +180,7 @@ def _compared(
         return work()
     except SyncError as error:
         raise SyncError(
-            f"{before}camera {name}, against {reference}: {error.statement()}", path=video.path, hint=hint
+            f"{before}camera {name}, compared with {reference}: {error.statement()}", path=video.path, hint=hint
         ) from error
 
 

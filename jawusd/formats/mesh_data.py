@@ -39,7 +39,7 @@ def read_mesh_bytes(path: Path) -> bytes:
     size = path.stat().st_size
     if size > MOST_BYTES:
         raise CaptureError(
-            f"is {size:,} bytes; at most {MOST_BYTES:,} are allowed.", path=path, hint="Decimate the mesh."
+            f"is {size:,} bytes long; at most {MOST_BYTES:,} bytes are allowed.", path=path, hint="Decimate the mesh."
         )
     return path.read_bytes()
 

@@ -15,7 +15,7 @@ from jawusd.geometry.so3 import hat
 #: Order of the landmarks in every table and file; all move with the mandible.
 LANDMARKS = ("incisor", "molar_left", "molar_right", "condyle_left", "condyle_right")
 
-#: How the description of an inferred landmark names condyles that come from population means.
+#: Words for population means in the description of inferred condyles.
 MEAN_CONDYLES = "at mean adult positions"
 
 # Used only without a mandible mesh: the mean Bonwill triangle of 120 adults in cone beam CT ("A
@@ -43,7 +43,8 @@ def anatomical_frame(upper_vertices: ArrayLike, lower_vertices: ArrayLike) -> Ar
     """Return T_anatomical_skull (4, 4) of two dental scans in occlusion, in any common scan frame.
 
     Up is the normal of the common plane of both arches, from the lower to the upper one; the midline is the mirror
-    axis of the arches in that plane; anterior is the closed end of the horseshoe-shaped arches. Teeth may be missing.
+    axis of the arches in that plane; anterior is the side of the closed end of the horseshoe-shaped arches. Teeth
+    may be missing.
 
     Args:
         upper_vertices, lower_vertices: crown vertices [mm], shapes (N, 3) and (M, 3).

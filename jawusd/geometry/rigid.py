@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 from jawusd.base.arrays import Array
 from jawusd.geometry.se3 import make_transform, transform_points
 
-_MIN_ASPECT = 1e-6  # ratio of the second to the first extent of points, below which they count as collinear
+_MIN_ASPECT = 1e-6  # ratio of the second-largest to the largest extent of points below which they count as collinear
 
 
 def rigid_fit(source: ArrayLike, target: ArrayLike, weights: ArrayLike | None = None) -> Array:

@@ -34,7 +34,7 @@ Triple = tuple[N, N, N]
 
 
 def angle_series(x: N) -> Triple[N]:
-    """Return a, b and c at a small squared angle x [rad^2], from their power series."""
+    """Return the coefficients a, b and c at a small squared angle x [rad^2], from their power series."""
     return (
         1.0 - x / 6.0 * (1.0 - x / 20.0 * (1.0 - x / 42.0)),
         0.5 - x / 24.0 * (1.0 - x / 30.0 * (1.0 - x / 56.0)),
@@ -43,12 +43,12 @@ def angle_series(x: N) -> Triple[N]:
 
 
 def angle_quotients(x: N, angle: N, sine: N, sine_of_half: N) -> Triple[N]:
-    """Return a, b and c at a squared angle x [rad^2] that is not small, given the angle and its sines."""
+    """Return a, b and c at a squared angle x [rad^2] that is not small, given the sines of the angle and its half."""
     return sine / angle, 2.0 * sine_of_half * sine_of_half / x, (angle - sine) / (x * angle)
 
 
 def angle_coefficients(x: float) -> Triple[float]:
-    """Return a, b and c at a squared angle x [rad^2]."""
+    """Return the coefficients a, b and c of Rodrigues' formula at a squared angle x [rad^2]."""
     if x < SMALL_SQUARED_ANGLE:
         return angle_series(x)
     angle = math.sqrt(x)

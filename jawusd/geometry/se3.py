@@ -151,7 +151,7 @@ def se3_adjoint(T: ArrayLike) -> Array:
 
 
 def orthonormalise(T: ArrayLike) -> Array:
-    """Return the nearest rigid transforms to (..., 4, 4) (SVD of the rotation block, Arun et al. 1987)."""
+    """Return the rigid transforms nearest to matrices (..., 4, 4) (SVD of the rotation block, Arun et al. 1987)."""
     T = np.asarray(T, dtype=np.float64)
     U, _, Vt = np.linalg.svd(T[..., :3, :3])
     sign = np.ones((*T.shape[:-2], 3))

@@ -34,7 +34,7 @@ def vee(W: ArrayLike) -> Array:
 
 
 def batched_angle_coefficients(squared: Array) -> tuple[Array, Array, Array]:
-    """Return a, b and c of `jawusd.geometry.rodrigues` at squared angles [rad^2] of any shape."""
+    """Return the coefficients a, b and c of `jawusd.geometry.rodrigues` at squared angles [rad^2] of any shape."""
     if np.ndim(squared) == 0 and squared < np.inf:  # one rotation: floats avoid the call overhead of numpy
         a, b, c = map(np.asarray, rodrigues.angle_coefficients(float(squared)))
         return a, b, c

@@ -46,6 +46,7 @@ class Clip(ABC):
         rotation_deg: counter-clockwise rotation stored in the file: 0, 90, 180 or 270. It is applied to every image.
         size_px: (width, height) after rotation.
         pixel_aspect: width of a pixel divided by its height, after rotation, as stated in the file; images are not
+            resampled.
         timecode: time code of the first image, as HH:MM:SS:FF; "" if there is none.
         timecode_fps: frame rate of the time code [Hz]; None if unknown.
         is_interlaced: whether any image decoded so far was marked as interlaced.

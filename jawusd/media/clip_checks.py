@@ -19,7 +19,7 @@ from jawusd.media.picture_sequence import PictureSequence
 _DRIFT_FRAMES = 0.5
 # Relative tolerance of frame rates [-]; accepts rounding to three digits, and 23.976 for 24, but not 25 for 24.
 _RATE_TOLERANCE = 0.005
-_DECODED_PX = 1.5e9  # maximum number of pixels decoded per clip; 700 full HD images, which takes seconds
+_DECODED_PX = 1.5e9  # maximum number of pixels decoded per clip: 700 full-HD images, which takes seconds
 _ENDS_S = 4.0  # duration that is decoded at each end of a clip; `sync` reads these parts first
 _PART = 48  # number of images per decoded part
 _SPARSE = 4  # pixel step in both directions when images are compared

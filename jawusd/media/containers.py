@@ -65,13 +65,13 @@ def open_container(
 def slices_are_whole(packet: bytes) -> bool:
     """Return whether all slices of an FFV1 image have correct checksums; false if slices have no checksums.
 
-    FFmpeg silently replaces damaged slices by those of the previous image. RFC 9043, 4.9: a slice ends with its size
+    FFmpeg silently replaces damaged slices with those of the previous image. RFC 9043, 4.9: a slice ends with its size
     (3 bytes), a status (1) and a CRC (4; polynomial 0x04C11DB7, highest bit first, initial value 0).
     """
     end = len(packet)
     while end >= 8:
         size = int.from_bytes(packet[end - 8 : end - 5], "big") + 8
-        # ZZ
+        # zlib processes the lowest bit first, and inverts the result.
         if size > end or zlib.crc32(packet[end - size : end].translate(_REVERSED), 0xFFFFFFFF) != 0xFFFFFFFF:
             return False
         end -= size

@@ -18,7 +18,7 @@ from jawusd.media.pixels import ColourPicture, DecodedPicture
 from jawusd.media.video import Video
 
 _WAIT_S = 0.1
-_KEPT = 8  # number of buffered images; more images than this never wait for processing
+_KEPT = 8  # maximum number of images that wait for processing; older ones are discarded
 # Address prefix of local devices, and PyAV's input format for them, by platform.
 _DEVICES = {"linux": ("/dev/", "v4l2"), "darwin": ("avfoundation:", "avfoundation"), "win32": ("video=", "dshow")}
 
@@ -118,7 +118,7 @@ class LiveSource:
                 if picture.rgb.shape[1::-1] != self._size_px:
                     found, wanted = "{} x {}".format(*picture.rgb.shape[1::-1]), "{} x {}".format(*self._size_px)
                     raise CaptureError(
-                        f"images have {found} px, but the calibration is for {wanted} px.", path=self.where
+                        f"images are {found} px, but the calibration is for {wanted} px.", path=self.where
                     )
                 with self._changed:
                     self._kept.append(picture)

@@ -26,7 +26,7 @@ _DEAD_ZONE = 0.06  # maximum deviation from a level caused by lossy coding, as a
 _NEAR = 24  # Maximum difference [of 255] between values of one level after blur or lossy coding.
 _FLAT = 10  # Maximum difference [of 255] between adjacent pixels inside a region; edges have larger differences.
 _ALIKE = 0.15  # maximum difference of one level between images of a source, as a fraction of the contrast
-# Maximum flat area of a third level relative to the second-largest one; soft edges have no flat area.
+# Maximum flat area of a third level relative to that of the second-largest level; soft edges have no flat area.
 _MOST_THIRD = 0.25
 # Minimum fraction of a third gray level's pixels that lie within 1 of its value for the level to count as a label;
 # photographs stay below it.
@@ -65,8 +65,8 @@ class MaskLevels:
     def coverage(self, image: RawImage) -> tuple[MaskImage | None, str]:
         """Return the mask of an image (0 to 255, outline at half), or None; and the reason why it is rejected.
 
-        The reason is a predicate whose subject is the image, and empty for masks and empty images. The mask may be the
-        input array itself.
+        The reason is a predicate whose subject is the image; it is empty for masks and empty images. The mask may be
+        the input array itself.
         """
         if (image.dtype == np.uint16) != self.deep:
             return None, f"has {8 * image.dtype.itemsize} bits per channel, unlike other images"
@@ -241,7 +241,8 @@ def _agreed(shown: Sequence[_Looked], lossy: bool) -> MaskLevels:
         values = sorted({levels.low, levels.high, levels.third or 0.0})
         raise NotMasks(
             number,
-            f"it has the levels {', '.join(f'{value:g}' for value in values)}; expected two, background and teeth.",
+            f"it has the levels {', '.join(f'{value:g}' for value in values)}; expected two levels, background and "
+            "teeth.",
             "Export one mask per arch, or name one file for both arches as masks.labels, with upper_value and "
             "lower_value.",
         )

@@ -22,14 +22,14 @@ from jawusd.media.timeline import Timeline
 from jawusd.media.video import Video
 
 _LOOKED_AT = 10  # number of label images that are sampled
-_AHEAD = 4  # number of buffered images; takes 8 MB per reader for full HD
+_AHEAD = 4  # number of buffered images; the buffer takes 8 MB per reader for full HD
 
 
 class MaskReader:
     """Reader of the masks of one arch in one camera.
 
     Sequential reads decode the next frames in a background thread; random access decodes on demand. A reader is not
-    thread-safe. Use it as a context manager or close it, or its thread never ends.
+    thread-safe. Use it as a context manager or close it; otherwise its thread never ends.
 
     Frames follow the camera's clock: frame k is shown k nominal frame durations after the camera's first image. In
     videos with a variable frame rate, some frames have no image and therefore no mask.

@@ -64,7 +64,7 @@ def _pixels(path: Path) -> int:
                 return image.width * image.height
     except Image.DecompressionBombError:
         return MOST_PX + 1
-    except Exception:  # Pillow does not know the format; OpenCV enforces a limit of its own
+    except Exception:  # Pillow does not support the format; OpenCV enforces a limit of its own
         return 0
 
 
@@ -135,7 +135,7 @@ def _quarters(path: Path) -> int:
     try:
         with Image.open(path) as image:
             orientation = image.getexif().get(ExifTags.Base.Orientation, 1)
-    except Exception:  # formats that Pillow does not know (EXR, DPX) have no Exif data
+    except Exception:  # formats that Pillow does not support (EXR, DPX) have no Exif data
         return 0
     if orientation in _MIRRORED:
         raise CaptureError("the orientation in the file is mirrored, which is not supported.", path=path, hint=_HINT)

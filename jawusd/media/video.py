@@ -145,7 +145,7 @@ class Video(Clip):
         if context.width * context.height > MOST_PX:
             container.close()
             raise CaptureError(
-                f"images have {context.width} x {context.height} px; at most {MOST_PX} px in total are allowed.",
+                f"images are {context.width} x {context.height} px; at most {MOST_PX} px in total are allowed.",
                 path=self.path,
                 hint="Scale the video down.",
             )

@@ -21,7 +21,7 @@ CONDYLE_MM = np.array([9.0, 4.2, 4.8])
 JOINT_SPACE_MM = 6.0
 _BONE = (222, 206, 178)
 _AROUND = 24
-# Share of the arch's scale in the rows of the mandible's body, from the chin to the ramus.
+# Fraction of the arch's scale applied to each row of the mandible's body, from the chin to the ramus.
 _ARCH_SHARE = np.array([1.0, 1.0, 1.0, 1.0, 0.5, 0.0])
 
 

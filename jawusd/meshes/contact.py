@@ -25,7 +25,7 @@ _DEEPEST_MM = 2.5
 _COARSEST_MM = 1.5
 
 _STEP_MM, _MOST_OPENING_MM = 0.3, 16.0  # grid step and maximum mouth opening of sampled tooth clearances
-# Clearances above this are sampled with the coarse step; twice NEAR_MM, below which errors are measured.
+# Clearance above which the coarse step is used: twice NEAR_MM, the clearance below which errors are measured.
 _CLOSE_MM = 1.0
 _BEYOND_MM = 1.0  # distance from the bound up to which poses outside it are also sampled
 _FREE_MM = 0.8  # minimum clearance of all valid poses at larger mouth openings for sampling to stop

@@ -13,8 +13,8 @@ from scipy.spatial import cKDTree
 from jawusd.base.arrays import Array, Indices
 from jawusd.formats.mesh import Mesh
 
-# Length [mm] over which normals are averaged before curvature is computed. Scanners round creases by some tenths of a
-# millimetre and cause ripples of some hundredths.
+# Length [mm] over which normals are averaged before curvature is computed. Scanners round creases by a few tenths of a
+# millimetre and cause ripples of a few hundredths.
 _SCALE_MM = 0.35
 _MOST_ROUNDS = 12
 # Creases are found from vertex normals up to this edge length, and from face angles above twice this length.
@@ -102,7 +102,7 @@ class ScanSurface:
         return ScanSurface(self.vertices, faces, self.of_vertex, self.piece, self.merged, self.empty, self.repeated)
 
     def normals(self) -> Array:
-        """Return the unit normals of the vertices, averaged over some tenths of a millimetre, shape (v, 3)."""
+        """Return the unit normals of the vertices, averaged over a few tenths of a millimetre, shape (v, 3)."""
         corners = self.vertices[self.faces]
         cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         n = len(self.vertices)

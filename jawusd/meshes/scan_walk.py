@@ -23,7 +23,7 @@ _SHARPEST = 3.0  # maximum curvature in the step weights [1/mm]; larger curvatur
 _COLOUR_WEIGHT = 0.02
 _COLOUR_STEP = 0.3  # minimum difference in crown probability between adjacent vertices for colour to support a border
 _TOLERANCE, _STEPS = 1e-3, 600
-# Minimum curvature [1/mm] of a crease that supports a border, and its maximum distance from the border.
+# Minimum curvature [1/mm] of a crease that supports a border, and maximum distance of the crease from the border.
 _EVIDENCE, _EVIDENCE_REACH_MM = 0.6, 0.5
 
 

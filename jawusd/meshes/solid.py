@@ -100,7 +100,7 @@ def distance_grid(corners: Array, outer: Mask, box: Array, step_mm: float, up: f
 
 
 def _walls(corners: Array, origin: Array, step: float, shape: tuple[int, ...]) -> Array:
-    """Return the grid's first and last cells (2, 3) along axes on which triangles extend beyond it, else infinity."""
+    """Return the grid's first and last cells (2, 3) on axes along which triangles extend beyond it, else infinity."""
     last = np.array(shape) - 1
     low, high = (corners.reshape(-1, 3) - origin).min(axis=0), (corners.reshape(-1, 3) - origin).max(axis=0)
     return np.array([np.where(low < 0, 0.0, -np.inf), np.where(high > step * last, last, np.inf)])

@@ -132,7 +132,7 @@ def test_clips_with_neither_flash_nor_sound_are_refused(tmp_path: Path) -> None:
     with pytest.raises(SyncError, match="camera a shows no light flash.*camera a has no sound"):
         align_videos({"a": silent, "b": loud}, "a")
     other = film(tmp_path / "other.mp4", np.arange(60) / FPS, np.ones(60), speech(2, 48000, 5))
-    with pytest.raises(SyncError, match="a shows no light flash.*camera b, against a: the sounds (do not )?match"):
+    with pytest.raises(SyncError, match="a shows no light flash.*b, compared with a: the sounds (do not )?match"):
         align_videos({"a": loud, "b": other}, "a")
     assert read_sound(silent, RATE_HZ) is None
 

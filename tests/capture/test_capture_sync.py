@@ -111,7 +111,7 @@ def test_lost_frames_are_noticed(tmp_path: Path) -> None:
         "b": film(tmp_path / "b.mp4", np.delete(lit, [100, 101, 102, 103])),
     }
     with pytest.raises(
-        SyncError, match=r"camera b, against a: the offset is 3\.0 frames at frame 7 and 7\.0 at frame 3\d\d"
+        SyncError, match=r"camera b, compared with a: the offset is 3\.0 frames at frame 7 and 7\.0 at frame 3\d\d"
     ):
         align_videos(videos, "a")
 

@@ -181,7 +181,7 @@ def test_what_is_no_table_is_said(tmp_path, data, words):
 
 def test_a_file_that_is_too_large_is_not_read(tmp_path):
     (tmp_path / "d.csv").write_text(1001 * "1")
-    with pytest.raises(FormatError, match="is 1001 bytes; at most 1000 are allowed"):
+    with pytest.raises(FormatError, match="is 1001 bytes long; at most 1000 bytes are allowed"):
         read_text(tmp_path / "d.csv", 1000)
 
 

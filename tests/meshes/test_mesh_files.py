@@ -278,5 +278,5 @@ def test_counts_are_capped_before_anything_is_read(tmp_path: Path, monkeypatch: 
         with pytest.raises(CaptureError, match="has 192 triangles; at most 191 are"):
             load_mesh(tmp_path / name)
     monkeypatch.setattr(mesh_data, "MOST_BYTES", 100)
-    with pytest.raises(CaptureError, match="bytes; at most 100 are"):
+    with pytest.raises(CaptureError, match="bytes long; at most 100 bytes are"):
         load_mesh(tmp_path / "a.stl")
