@@ -43,7 +43,7 @@ def angle_series(x: N) -> Triple[N]:
 
 
 def angle_quotients(x: N, angle: N, sine: N, sine_of_half: N) -> Triple[N]:
-    """Return a, b and c at a squared angle x [rad^2] that is not small, given the sines of the angle and its half."""
+    """Return a, b and c at a squared angle x [rad^2], not small, given the angle, its sine and the sine of its half."""
     return sine / angle, 2.0 * sine_of_half * sine_of_half / x, (angle - sine) / (x * angle)
 
 
