@@ -111,8 +111,8 @@ def _choose(names: tuple[str, ...], clips: list[BoardClip]) -> tuple[list[int], 
     if len(set(counts)) > 1:
         listed = ", ".join(f"{name} {count}" for name, count in zip(names, counts))
         notes.append(
-            f"the board clips have different numbers of images ({listed}): {len(shared)} with equal number or time "
-            "are assumed simultaneous; a clip trimmed at its start would invalidate the result."
+            f"the board clips have different numbers of images ({listed}): {len(shared)} images with equal number or "
+            "time are assumed to be simultaneous; a clip trimmed at its start would invalidate the result."
         )
     if not all(clip.is_video for clip in clips):
         step = max(1, -(-len(shared) // MOST_VIEWS))
@@ -137,7 +137,7 @@ def _check_board(name: str, clip: BoardClip, chosen: list[int], boards: Boards, 
     missed = found < len(chosen) / 2
     if missed and clip.is_interlaced:
         raise CalibrationError(
-            f"the board is found in {found} of {len(chosen)} images: {INTERLACED}.",
+            f"the board was found in {found} of {len(chosen)} images: {INTERLACED}.",
             camera=name,
             path=clip.path,
             hint=INTERLACED_HINT,

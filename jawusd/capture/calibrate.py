@@ -183,8 +183,8 @@ def _advice(
     for name, figure in figures.items():
         if figure["rms_px"] > _GOOD_RMS_PX:
             advice.append(
-                f"camera {name} has a reprojection error of {figure['rms_px']:.2f} px rms (good is below "
-                f"{_GOOD_RMS_PX:g}): check for blur, a bent board, a zoom or a camera that moved."
+                f"camera {name} has a reprojection error of {figure['rms_px']:.2f} px rms (a good value is "
+                f"below {_GOOD_RMS_PX:g} px): check for blur, a bent board, a zoom or a camera that moved."
             )
         if figure["coverage"] < _LITTLE_COVERAGE or figure["empty_corners"]:
             empty = ", ".join(figure["empty_corners"]) or "parts"

@@ -59,12 +59,12 @@ def _lens_findings(camera: Camera, path: str) -> Iterator[Finding]:
         yield warning("focal_length", message, focal, high if focal > high else low)
     uneven = float(abs(camera.K[1, 1] / camera.K[0, 0] - 1.0))
     if uneven > _SQUARE:
-        message = f"its focal lengths fx and fy differ by {uneven:.1%}; at most {_SQUARE:.0%} is usual"
+        message = f"its focal lengths fx and fy differ by {uneven:.1%}; a difference of at most {_SQUARE:.0%} is usual"
         yield warning("pixels_not_square", message, uneven, _SQUARE)
     middle = np.array([width - 1, height - 1]) / 2
     off = float(np.abs(camera.K[:2, 2] - middle).max() / width)
     if off > _CENTRE_SHARE:
-        message = f"its principal point is {off:.0%} of the image width off the centre; at most "
+        message = f"its principal point is {off:.0%} of the image width off the centre; an offset of at most "
         yield warning("principal_point", message + f"{_CENTRE_SHARE:.0%} is usual", off, _CENTRE_SHARE)
     if (worst := _fold(camera)) is not None:
         message = f"its distortion folds over at {worst:.0%} of the way to the corner: it is not invertible there"

@@ -74,8 +74,8 @@ def centre_findings(cameras: Mapping[str, Camera], centres: Sequence[Sequence[Ma
     yield Finding(
         "cameras_contradict",
         "warning",
-        f"its rays through the centre of the teeth miss those of camera {other} by {mm:.0f} mm; at most {_RAYS_MM:g} "
-        "mm is plausible",
+        f"its rays through the centre of the teeth miss those of camera {other} by {mm:.0f} mm; a distance "
+        f"of at most {_RAYS_MM:g} mm is plausible",
         mm,
         _RAYS_MM,
         camera=worst,
@@ -106,8 +106,8 @@ def width_findings(cameras: Mapping[str, Camera], pixels: Mapping[str, Array]) -
         yield Finding(
             "teeth_size",
             "warning",
-            f"with this calibration, the teeth in the masks are {width:.3g} mm wide; {_SEEN_MM[0]:g} to "
-            f"{_SEEN_MM[1]:g} mm is plausible",
+            f"with this calibration, the teeth in the masks are {width:.3g} mm wide; a width of "
+            f"{_SEEN_MM[0]:g} to {_SEEN_MM[1]:g} mm is plausible",
             width,
             _SEEN_MM[width > _SEEN_MM[1]],
             hint="Check calibration_unit_mm, the board's square size, and that the masks belong to this calibration.",

@@ -80,7 +80,7 @@ def estimate_offsets(capture: Capture) -> Alignment:
     rate = open_clip(videos[capture.reference]).timeline.rate
     if abs(rate / capture.fps - 1) < _FPS_TOLERANCE:
         return found
-    said = f"capture.toml has fps = {capture.fps:g}, which is used as the time base"
+    said = f"but capture.toml has fps = {capture.fps:g}, which is used as the time base"
     note = f"the clips run at {rate:.6g} frames per second, {said}"
     return replace(found, notes=(*found.notes, note))
 

@@ -90,7 +90,7 @@ def skin_fit(
     """Learn d from facial skin in frames with visible teeth, to estimate the jaw in frames with closed lips.
 
     Points must be relative to the head: stabilised, or with --rigid head=MARKERS. The take must contain the jaw
-    exercises, speech with visible teeth, every expression, and some seconds of occlusion (--bite).
+    exercises, speech with visible teeth, every expression, and a few seconds of occlusion (--bite).
     """
     import math
 

@@ -57,7 +57,7 @@ def fit_skin(
 ) -> Skin:
     """Learn the jaw parameters d from facial skin.
 
-    The take must contain exercises and speech with visible teeth, every expression that occurs later, and some seconds
+    The take must contain exercises and speech with visible teeth, every expression that occurs later, and a few seconds
     with closed lips and the teeth in occlusion, where d is 0.
 
     Args:

@@ -88,7 +88,8 @@ class MaskLevels:
         if inside > mask.size / 2 and border_share(mask, 127.5) > 0.5:
             return (
                 None,
-                f"has {inside / mask.size:.0%} teeth, up to the border: it seems inverted, unlike other images",
+                f"shows teeth in {inside / mask.size:.0%} of its area, up to the border: it seems inverted, unlike "
+                "other images",
             )
         return mask, ""
 

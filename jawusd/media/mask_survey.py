@@ -109,8 +109,8 @@ def _of_levels(source: CameraSource, rows: str, levels: MaskLevels) -> list[Find
                 "masks_soft",
                 "warning",
                 f"in the masks of {rows} teeth, {levels.soft:.0%} of the segmented pixels lie between background "
-                f"({levels.background:g}) and teeth ({levels.teeth:g}); at most {MOST_SOFT:.0%} is usual. The outline "
-                "is placed midway.",
+                f"({levels.background:g}) and teeth ({levels.teeth:g}); a fraction of at most {MOST_SOFT:.0%} is "
+                "usual. The outline is placed midway.",
                 value=round(levels.soft, 3),
                 limit=MOST_SOFT,
                 camera=source.name,

@@ -264,7 +264,7 @@ def test_clips_of_variable_rate_are_matched_by_time(tmp_path):
             container.mux(stream.encode(None))
         paths.append(path)
     found = find_boards(NAMES, board(videos=tuple(paths)), quiet)
-    assert len(found.numbers) == 5 and "(c0 12, c1 10): 10 with equal number or time" in found.notes[0]
+    assert len(found.numbers) == 5 and "(c0 12, c1 10): 10 images with equal number or time" in found.notes[0]
     grid = corner_grid(board())
     for c, camera in enumerate(CAMERAS):
         for v, number in enumerate(found.numbers):

@@ -147,7 +147,7 @@ def test_advice_names_what_was_done_badly(tmp_path):
     assert "uses 20 views" in advice and "mm from the mouth" in advice
     noisy = detections(CAMERAS, boards, poses(45, rng), rng, noise_px=0.8)
     advice = " ".join(calibrate_detections(noisy, capture, {})[1].advice)
-    assert "px rms (good is below 0.5)" in advice and "% of the image" in advice
+    assert "px rms (a good value is below 0.5 px)" in advice and "% of the image" in advice
 
 
 def test_one_camera_alone_is_calibrated(tmp_path):

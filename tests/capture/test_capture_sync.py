@@ -183,7 +183,7 @@ def test_a_capture_is_aligned_to_its_reference(tmp_path: Path) -> None:
     assert found.notes == ()
     faster = capture(tmp_path, videos, reference="b").model_copy(update={"fps": 48.0})
     assert estimate_offsets(faster).notes == (
-        "the clips run at 24 frames per second, capture.toml has fps = 48, which is used as the time base",
+        "the clips run at 24 frames per second, but capture.toml has fps = 48, which is used as the time base",
     )
     message = r"capture\.toml: camera c has no video.*offsets = \{ a = \.\., b = \.\., c = \.\. \}"
     with pytest.raises(SyncError, match=message):
