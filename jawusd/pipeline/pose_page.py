@@ -41,7 +41,8 @@ def write_page(path: str | os.PathLike[str], out: Path, prim: str | None = None)
         rig=rig,
         parts=tuple(parts),
         axes=grid_axes(rig, valid_box(rig), moving.vertices, DEFAULT_SIZE),
-        clip=np.zeros((0, 3)) if clip is None else rig.project(clip.at(np.arange(clip.span[0], clip.span[1] + 1))),
+        take=np.zeros((0, 3)) if clip is None else clip.at(np.arange(clip.span[0], clip.span[1] + 1)),
+        first=0 if clip is None else round(clip.span[0]),
         fps=actor.fps if clip is None else clip.fps,
     )
     write_pose_page(out, page)

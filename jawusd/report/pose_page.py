@@ -1,4 +1,4 @@
-"""Write a web page that poses a rig without a server: meshes, sampled decoder and bound in one HTML file."""
+"""Write a web page that poses and keys a rig without a server: meshes, sampled decoder and bound in one HTML file."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import os
 from dataclasses import dataclass
 
 import numpy as np
+from markupsafe import Markup
 
 from jawusd.base.arrays import Array
 from jawusd.evaluator import JawRig
@@ -16,6 +17,8 @@ from jawusd.geometry.se3 import se3_log
 from jawusd.report.replay import encoded, packed
 from jawusd.report.templates import package_file, page_environment
 
+_SCRIPTS = ("scene.js", "decoder.js", "drag.js", "keys.js", "timeline.js", "pose.js")
+
 
 @dataclass(frozen=True, eq=False)
 class PosePage:
@@ -25,8 +28,9 @@ class PosePage:
     rig: JawRig
     parts: tuple[ReplayPart, ...]
     axes: tuple[Array, Array, Array]  # grid of the sampled decoder: increasing values of d1, d2 and d3 [mm]
-    clip: Array  # parameters of the take that the page plays [mm], shape (F, 3); F = 0 without a take
-    fps: float  # frame rate of the take
+    take: Array  # parameters of the take, frame by frame [mm], shape (F, 3); F = 0 without a take
+    first: int  # first frame of the take
+    fps: float  # frame rate of the take, and of keys
 
 
 def write_pose_page(path: str | os.PathLike[str], page: PosePage) -> None:
@@ -41,7 +45,7 @@ def write_pose_page(path: str | os.PathLike[str], page: PosePage) -> None:
         .render(
             name=page.name,
             style=package_file("report.css"),
-            script=package_file("scene.js") + package_file("pose.js"),
+            script=Markup().join(map(package_file, _SCRIPTS)),
             data=pose_data(page),
         )
     )
@@ -52,7 +56,7 @@ def pose_data(page: PosePage) -> dict[str, object]:
     """Return the input of pose.js, ready for JSON encoding.
 
     The table contains, for each grid point, the twist (omega [rad], v [mm]) of the motion relative to occlusion in the
-    anatomical frame, and the margin [mm].
+    anatomical frame, and the margin [mm]. The take contains d and the margin of every frame [mm].
     """
     rig = page.rig
     d = np.stack(np.meshgrid(*page.axes, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -63,8 +67,10 @@ def pose_data(page: PosePage) -> dict[str, object]:
         "parts": [packed(part) for part in page.parts],
         "axes": [axis.round(6).tolist() for axis in page.axes],
         "table": encoded(np.column_stack([twists, rig.margin(d)]).astype("<f4")),
-        "clip": encoded(page.clip.astype("<f4")),
+        "take": encoded(np.column_stack([page.take, rig.margin(page.take)]).astype("<f4")),
+        "first": page.first,
         "fps": page.fps,
+        "tolerance": rig.tolerance_mm,
         "centre": (0.5 * (low + high)).round(2).tolist(),
         "radius": round(float(np.linalg.norm(high - low)) / 2, 2),
     }

@@ -1,19 +1,26 @@
-"""The page that poses a rig without a server, opened from disk in a browser: its jaw is the evaluator's."""
+"""The page that poses and keys a rig without a server, opened from disk in a browser: its jaw is the evaluator's."""
 
+import io
 import json
 
 import numpy as np
 import pytest
 from browser import headless_chromium, keep_picture, open_page
+from PIL import Image
 from run_jawusd import run
 
+from jawusd.evaluator.interpolation import interpolate_smooth
 from jawusd.evaluator.motions import motions_of_poses
+from jawusd.formats.keys import load_keys
+from jawusd.formats.poses import read_parameters
 from jawusd.geometry.se3 import transform_points
 from jawusd.pipeline.pose_page import write_page
 from jawusd.rig.layout import EXAMPLE_RIG
 from jawusd.rig.read import load_rig
 
 chromium = pytest.fixture(headless_chromium, scope="module")
+WANTED = {40: (0, 0, 0), 80: (22, 0, 0), 90: (25, 1, 2), 140: (6, -3, 1)}  # frames of keys, and their poses [mm]
+SET = "(e, v) => { e.value = v; e.dispatchEvent(new Event('input')); }"
 
 
 @pytest.fixture(scope="module")
@@ -31,7 +38,7 @@ def rig():
 class Jaw:
     """The open page."""
 
-    def __init__(self, chromium, file, width=1200, height=900, **context):
+    def __init__(self, chromium, file, width=1100, height=800, **context):
         self.web, self.trouble, self.requests = open_page(chromium, width, height, **context), [], []
         self.web.on("console", lambda message: self.trouble.append(message.text) if message.type == "error" else None)
         self.web.on("pageerror", lambda error: self.trouble.append(str(error)))
@@ -42,7 +49,8 @@ class Jaw:
     def close(self, name):
         keep_picture(self.web, name, full_page=True)
         self.web.context.close()
-        assert self.trouble == [] and len(self.requests) == 1
+        assert self.trouble == []
+        assert [url for url in self.requests if not url.startswith("blob:")] == self.requests[:1]
 
     def pose(self):
         """Return d (3,) [mm] and the motion (4, 4) that the page shows."""
@@ -58,13 +66,84 @@ class Jaw:
                 return box["x"] + box["width"] / 2, y + 6
         raise AssertionError("nothing moves in the middle of the page")
 
-    def drag(self, dx, dy):
-        x, y = self.grabbable()
-        self.web.mouse.move(x, y)
+    def pull(self, start, dx, dy):
+        """Drag from a place in the page [px]."""
+        self.web.mouse.move(*start)
         self.web.mouse.down()
-        self.web.mouse.move(x + dx, y + dy, steps=8)
+        self.web.mouse.move(start[0] + dx, start[1] + dy, steps=8)
         self.web.mouse.up()
+
+    def drag(self, dx, dy):
+        self.pull(self.grabbable(), dx, dy)
         return self.pose()
+
+    def read_keys(self):
+        return json.loads(self.web.locator("#jaw").evaluate("e => e.dataset.keys ?? '[]'"))
+
+    def area(self):
+        return json.loads(self.part("timeline").get_attribute("data-area"))
+
+    def place(self, frame, value=None):
+        """Return the place in the page [px] of a frame on the timeline: at a value [mm] or on the ruler."""
+        area, box = self.area(), self.part("timeline").bounding_box()
+        (first, last), (low, high) = area["view"], area["range"]
+        x = area["left"] + (frame - first) / (last - first) * (area["right"] - area["left"])
+        y = 10 if value is None else area["bottom"] - (value - low) / (high - low) * (area["bottom"] - area["top"])
+        return box["x"] + x, box["y"] + y
+
+    def seek(self, frame):
+        self.web.mouse.click(*self.place(frame))
+        assert self.part("frame").inner_text() == f"frame {frame}"
+
+    def set_pose(self, d):
+        self.part("close").click()
+        for name, value in zip(("d1", "d2", "d3"), d, strict=True):
+            self.part(name).evaluate(SET, value)
+
+    def strip(self, frame):
+        """Return the grade of a frame in the strip below the ruler: the nearest colour of the style sheet."""
+        with Image.open(io.BytesIO(self.part("timeline").screenshot())) as picture:
+            x, y = self.place(frame)
+            box = self.part("timeline").bounding_box()
+            shown = np.array(picture.convert("RGB").getpixel((round(x - box["x"] + 3), 24)))
+        colors = {"green": (0, 158, 115), "orange": (230, 159, 0), "vermilion": (213, 94, 0)}
+        return min(colors, key=lambda name: np.abs(np.array(colors[name]) - shown).sum())
+
+
+@pytest.fixture(scope="module")
+def opened(chromium, file):
+    jaw = Jaw(chromium, file, reduced_motion="reduce", color_scheme="light")
+    yield jaw
+    jaw.close("pose_page_1100_light")
+
+
+@pytest.fixture
+def jaw(opened):
+    """Return the open page, paused, with the jaw closed, in a front view."""
+    if opened.part("play").inner_text() == "Pause":
+        opened.part("play").click()
+    opened.web.click('[data-view="front"]')
+    opened.part("close").click()
+    return opened
+
+
+@pytest.fixture(scope="module")
+def first_keys(opened):
+    """Add a key at each frame of WANTED, and return the keys."""
+    for frame, d in WANTED.items():
+        opened.seek(frame)
+        opened.set_pose(d)
+        opened.web.keyboard.press("k")
+    assert [key["frame"] for key in opened.read_keys()] == list(WANTED)
+    return opened.read_keys()
+
+
+@pytest.fixture
+def keyed(jaw, first_keys):
+    """Return the page with the first keys; what another test did to them is undone."""
+    while jaw.read_keys() != first_keys:
+        jaw.part("undo").click()
+    return jaw
 
 
 def off_mm(rig, d, motion):
@@ -74,44 +153,134 @@ def off_mm(rig, d, motion):
     return np.linalg.norm(transform_points(motion, rest) - transform_points(exact, rest), axis=-1).max()
 
 
+def interpolated(keys, frames):
+    """Return the evaluator's smooth curve through the keys of the page at frames, shape (n, 3) [mm]."""
+    times, d = np.array([key["frame"] for key in keys], float), np.array([key["d"] for key in keys])
+    return interpolate_smooth(times, d, np.array(frames, float), None)
+
+
 @pytest.mark.parametrize(
     ("view", "dx", "dy"), [("front", 0, 90), ("front", 40, 60), ("left", 0, 70), ("right", -30, 60)]
 )
-def test_a_dragged_jaw_is_posed_as_the_evaluator_poses_it_and_stays_inside(chromium, file, rig, view, dx, dy):
-    jaw = Jaw(chromium, file)
-    jaw.part("close").click()
+def test_a_dragged_jaw_is_posed_as_the_evaluator_poses_it_and_stays_inside(jaw, rig, view, dx, dy):
     jaw.web.click(f'[data-view="{view}"]')
     d, motion = jaw.drag(dx, dy)
     assert d[0] > 5 and float(rig.margin(d)) >= -0.05 and off_mm(rig, d, motion) < 0.05
     if view == "front":
         assert abs(d[2]) < 1 and (abs(d[1]) < 0.5 if dx == 0 else abs(d[1]) > 1)  # the habitual path gives the depth
-    jaw.close(f"pose_page_{view}_{dx}")
 
 
-def test_a_drag_beyond_the_bound_stops_there(chromium, file, rig):
-    jaw = Jaw(chromium, file)
-    jaw.part("close").click()
+def test_a_drag_beyond_the_bound_stops_there(jaw, rig):
     d, motion = jaw.drag(300, 20)
     assert -0.05 <= float(rig.margin(d)) < 0.5 and off_mm(rig, d, motion) < 0.05
-    jaw.close("pose_page_bound")
 
 
-@pytest.mark.parametrize(("width", "scheme"), [(1440, "light"), (390, "dark")])
-def test_the_take_plays_and_sliders_pose_the_jaw(chromium, file, rig, width, scheme):
-    jaw = Jaw(chromium, file, width, 844, color_scheme=scheme)
+def test_sliders_pose_the_jaw(jaw, rig):
+    jaw.part("d1").evaluate(SET, 12)
+    d, motion = jaw.pose()
+    assert d[0] == pytest.approx(12, abs=0.1) and off_mm(rig, d, motion) < 0.05
+    assert "inside the bound" in jaw.part("margin").inner_text()
+
+
+def test_the_timeline_scrubs_the_take_and_zooms_around_the_pointer(jaw):
+    jaw.part("source").select_option("take")
+    jaw.seek(57)
+    open_mm = jaw.pose()[0][0]
+    jaw.pull(jaw.place(57), jaw.place(30)[0] - jaw.place(57)[0], 0)
+    assert jaw.part("frame").inner_text() == "frame 30" and jaw.pose()[0][0] < open_mm - 20
+    whole = jaw.area()["view"]
+    jaw.web.mouse.move(*jaw.place(100))
+    jaw.web.mouse.wheel(0, -400)
+    jaw.web.wait_for_function(
+        "w => JSON.parse(document.querySelector('[data-jaw=timeline]').dataset.area).view[0] > w", arg=whole[0]
+    )
+    first, last = jaw.area()["view"]
+    assert last - first < 0.6 * (whole[1] - whole[0])
+    assert (100 - first) / (last - first) == pytest.approx((100 - whole[0]) / (whole[1] - whole[0]), abs=0.01)
+    jaw.web.mouse.dblclick(*jaw.place(100))
+    assert jaw.area()["view"] == whole
+
+
+def test_keys_are_interpolated_as_the_evaluator_does_and_play(keyed):
+    frames = [30, 60, 85, 100, 120, 139, 200]
+    for frame, d in zip(frames, interpolated(keyed.read_keys(), frames), strict=True):
+        keyed.seek(frame)
+        np.testing.assert_allclose(keyed.pose()[0], d, atol=1e-6)
+    keyed.part("play").click()
+    assert keyed.part("play").inner_text() == "Pause"
+    keyed.web.wait_for_function("() => JSON.parse(document.getElementById('jaw').dataset.d)[0] > 3")
+    keyed.web.keyboard.press("k")  # adds a key at the frame that is shown, and pauses
+    assert keyed.part("play").inner_text() == "Play"
+    assert int(keyed.part("frame").inner_text().split()[1]) in [key["frame"] for key in keyed.read_keys()]
+
+
+def test_a_key_is_dragged_in_time_and_value_deleted_undone_and_redone(keyed):
+    before = keyed.read_keys()
+    start = keyed.place(80, before[1]["d"][0])
+    keyed.pull(start, keyed.place(70)[0] - start[0], keyed.place(70, 12)[1] - start[1])
+    dragged = keyed.read_keys()
+    assert dragged[1]["frame"] == 70 and dragged[1]["d"][0] == pytest.approx(12, abs=0.5)
+    assert dragged[1]["d"][1:] == before[1]["d"][1:] and dragged[0::2] == before[0::2]
+    np.testing.assert_allclose(keyed.pose()[0], dragged[1]["d"], atol=1e-6)  # the jaw follows
+    keyed.web.keyboard.press("Control+z")
+    assert keyed.read_keys() == before
+    keyed.web.keyboard.press("Control+Shift+z")
+    assert keyed.read_keys() == dragged
+    keyed.seek(70)
+    keyed.web.keyboard.press("Delete")
+    assert keyed.read_keys() == [dragged[0], *dragged[2:]]
+    keyed.part("undo").click()
+    assert keyed.read_keys() == dragged
+
+
+def test_a_key_dragged_past_another_does_not_replace_it(keyed):
+    start = keyed.place(80)
+    keyed.pull((start[0], start[1] + 29), keyed.place(90)[0] - start[0], 0)  # its diamond, below ruler and strip
+    assert len(keyed.read_keys()) == len(WANTED) and keyed.read_keys()[1]["frame"] in (89, 88)
+
+
+def test_the_strip_shows_where_keys_leave_the_bound(keyed, rig):
+    assert keyed.strip(80) == "green" and rig.margin(keyed.read_keys()[1]["d"]) > 0
+    area = keyed.area()
+    start = keyed.place(90, keyed.read_keys()[2]["d"][1])
+    keyed.pull(start, 0, keyed.place(90, min(24, area["range"][1]))[1] - start[1])
+    pushed, frames = keyed.read_keys(), np.arange(40, 141)
+    margin = rig.margin(interpolated(pushed, frames))
+    (close,) = np.flatnonzero(margin == margin[(margin < -0.3) & (margin > -0.9)][0])[:1]
+    assert rig.margin(pushed[2]["d"]) < -rig.tolerance_mm
+    assert keyed.strip(90) == "vermilion" and keyed.strip(int(frames[close])) == "orange" and keyed.strip(50) == "green"
+    keyed.seek(90)
+    assert "outside the bound" in keyed.part("margin").inner_text()
+
+
+def test_the_keys_are_downloaded_as_files_that_animate_reads(keyed, tmp_path):
+    for name in ("json", "csv"):
+        with keyed.web.expect_download() as loading:
+            keyed.part(name).click()
+        loading.value.save_as(tmp_path / loading.value.suggested_filename)
+    keys = load_keys(tmp_path / "keys.json")
+    assert keys.interpolation == "smooth" and keys.fps == 24
+    assert [{"frame": key.frame, "d": list(key.d)} for key in keys.keys] == keyed.read_keys()
+    frames, d = read_parameters(tmp_path / "d.csv")
+    assert frames.tolist() == list(range(40, 141))
+    np.testing.assert_allclose(d, interpolated(keyed.read_keys(), frames), atol=1e-4)
+
+
+def test_on_a_phone_the_take_plays_and_the_timeline_is_in_reach(chromium, file):
+    jaw = Jaw(chromium, file, 390, 844, color_scheme="dark", has_touch=True)
     first, _ = jaw.pose()
     moved = "before => document.getElementById('jaw').dataset.d !== before"
     jaw.web.wait_for_function(moved, arg=json.dumps(first.tolist()))
     assert jaw.part("play").inner_text() == "Pause"
-    jaw.part("d1").evaluate("(e, v) => { e.value = v; e.dispatchEvent(new Event('input')); }", 12)
-    assert jaw.part("play").inner_text() == "Play the take"
-    jaw.part("close").click()
-    jaw.part("d1").evaluate("(e, v) => { e.value = v; e.dispatchEvent(new Event('input')); }", 12)
-    d, motion = jaw.pose()
-    assert d[0] == pytest.approx(12, abs=0.1) and off_mm(rig, d, motion) < 0.05
-    assert "inside the bound" in jaw.part("margin").inner_text()
-    assert jaw.web.evaluate("document.documentElement.scrollWidth") <= width
-    jaw.close(f"pose_page_{width}_{scheme}")
+    box, jaws = jaw.part("timeline").bounding_box(), jaw.part("canvas").bounding_box()
+    assert box["y"] + box["height"] <= 844 and box["height"] > 100 and box["width"] > 300
+    assert jaws["y"] + jaws["height"] < box["y"]  # both are visible without scrolling
+    jaw.web.touchscreen.tap(*jaw.place(57))
+    assert jaw.part("play").inner_text() == "Play" and jaw.pose()[0][0] > 20
+    jaw.part("key").tap()
+    assert [key["frame"] for key in jaw.read_keys()] == [int(jaw.part("frame").inner_text().split()[1])]
+    assert jaw.web.evaluate("document.documentElement.scrollWidth") <= 390
+    jaw.close("pose_page_390_dark")
 
 
 def test_the_command_writes_the_page_and_keeps_other_files(tmp_path):
