@@ -1,4 +1,4 @@
-"""The page of a capture; every visitor has their own view and picks."""
+"""The page of a capture; every visitor has a separate view and separate picks."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class CapturePage:
         footage, picks, labels: the panels.
         layout: layout of the current image; None before the first one.
         poses: T_page_scan (4, 4) of the displayed scans, by arch.
-        drawn: number of the state drawn last.
+        drawn: number of the redraw request that was drawn last.
     """
 
     def __init__(self, client: viser.ClientHandle, capture: ViewedCapture) -> None:
@@ -215,7 +215,7 @@ class CapturePage:
         return region_around(pixels, size) if len(pixels) > 1 else (0.0, 0.0, size[0] - 1.0, size[1] - 1.0)
 
     def _default_pose(self) -> Array:
-        """Return T_world_scan of untracked scans: at the intersection of the optical axes, facing the first camera."""
+        """Return T_world_scan for untracked scans: where the optical axes intersect, facing the first camera."""
         cameras = list(self._capture.cameras.values())
         axes = np.stack([camera.T_cam_world[2, :3] for camera in cameras])
         across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
@@ -263,7 +263,7 @@ class CapturePage:
         self.scene.show_labels(arch, *(brush.faces_with(arch, label) for label in BRUSHES.values()))
 
     def close(self) -> None:
-        """Stop the tasks of this page."""
+        """Stop the background tasks of this page."""
         self.footage.player.close()
         if self._drawing is not None:
             self._drawing.cancel()

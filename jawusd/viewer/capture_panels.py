@@ -66,7 +66,7 @@ class FootagePanel:
             gui.add_html(self._plot.definition())
         self._playhead = gui.add_html("")
         first, last = capture.frames
-        self.slider = gui.add_slider("frame", first, max(last, first + 1), 1, self.frame)  # viser needs two values
+        self.slider = gui.add_slider("frame", first, max(last, first + 1), 1, self.frame)  # ends must differ
         self.slider.on_update(guarded(client, self._slide))
         self.play = gui.add_button("play", icon=viser.Icon.PLAYER_PLAY)
         self.play.on_click(guarded(client, self._toggle))
@@ -226,7 +226,7 @@ class PicksPanel:
         self.refresh()
 
     def show_fit(self, words: str) -> None:
-        """Show a sentence that says whether the picks are consistent."""
+        """Show a sentence on the consistency of the picks."""
         self._fit = words
         self.refresh()
 

@@ -1,4 +1,4 @@
-"""A capture in 3-D: an image with the scans in front of it, or the calibrated cameras around the scans."""
+"""3-D scene of a capture: an image with the scans in front of it, or the calibrated cameras around the scans."""
 
 from __future__ import annotations
 
@@ -183,7 +183,7 @@ class CaptureScene:
 
 
 def set_first_view(server: viser.ViserServer) -> None:
-    """Start every page with an upright virtual camera in front of the image."""
+    """Set the initial virtual camera of every page: upright, in front of the image."""
     server.scene.set_up_direction("-y")
     first = server.initial_camera
     first.position, first.look_at, first.up = (0.0, 0.0, -_FIRST_EYE_MM), (0.0, 0.0, 0.0), UP

@@ -88,7 +88,7 @@ def at_frames(keys: KeyTrack, frames: Sequence[float]) -> KeyTrack:
 def frame_after(frame: float, elapsed_s: float, fps: float, span: tuple[float, float], loop: bool) -> float | None:
     """Return the frame to show `elapsed_s` seconds after `frame`; None past the end if playback does not loop.
 
-    Playback starts at the beginning of the span if `frame` lies outside it.
+    If `frame` lies outside the span (first and last frame), playback starts at the first frame.
     """
     first, last = span
     if not first <= frame < last:
@@ -104,7 +104,7 @@ class Player:
     """Playback of a motion in the asyncio event loop."""
 
     def __init__(self, show: Callable[[float], None], ended: Callable[[], None]) -> None:
-        """Call `show` with every frame number during playback, and `ended` when it stops, except through `close`."""
+        """Store the callbacks `show`, called with every frame number, and `ended`, called on any stop but `close`."""
         self._show, self._ended = show, ended
         self._task: asyncio.Task[None] | None = None
 
@@ -125,7 +125,7 @@ class Player:
             self._ended()
 
     def close(self) -> None:
-        """Stop playback without calling `ended`, for a page that is gone."""
+        """Stop playback without calling `ended`, for a page that was closed."""
         if self._task is not None:
             self._task.cancel()
             self._task = None

@@ -27,7 +27,7 @@ _MOST_THUMBS = 40  # maximum number of keys that are shown in a multi-slider
 
 
 class Playback:
-    """Line of text that names the motion and its current frame, and button that plays and pauses it."""
+    """A line with the name and current frame of the motion, and a button that plays and pauses it."""
 
     def __init__(self, client: viser.ClientHandle) -> None:
         """Add the line and the button to the current container."""
@@ -95,7 +95,7 @@ class MotionPanel:
         self._begin(clip)
 
     def offer_clips(self) -> None:
-        """Add motions that have appeared beside the rig."""
+        """Add motions whose files have appeared in the rig's folder."""
         self.source.options = tuple(dict.fromkeys((*self.source.options, *self._actor.clip_names())))
 
     def show(self, frame: float) -> None:
@@ -146,7 +146,7 @@ class MotionPanel:
         self.thumbs.visible = visible
 
     async def play_take(self) -> None:
-        """Play the captured take, if there is one, unless the visitor did something while it was being read."""
+        """Play the captured take, if there is one, unless the visitor used the page while the take was being read."""
         take, source, work = self._actor.take, self.source.value, self._session.work
         if take is None:
             return

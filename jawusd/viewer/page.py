@@ -1,4 +1,4 @@
-"""The page of a rig; every visitor has their own session."""
+"""The page of a rig; every visitor has a separate session."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class StaticPlots:
 
 
 class PlotPanel:
-    """Plots of one page in which the current pose is marked: bounds and Posselt's figures."""
+    """The plots of one page, with the current pose marked: bounds and Posselt's figures."""
 
     def __init__(self, client: viser.ClientHandle, rig: JawRig, static: StaticPlots) -> None:
         """Add the panel, docked on the left."""

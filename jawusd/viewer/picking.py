@@ -116,7 +116,7 @@ class PickBook:
         self.picks, self.frame, self.selected = [], None, None
 
     def missing(self) -> str:
-        """Return what is missing until the picks can be written; "" if they are complete."""
+        """Return what must be added before the picks can be written; "" if they are complete."""
         for arch in ARCHES:
             whole = sum(len(pick.views) >= _FEWEST_VIEWS for pick in self.picks if pick.arch == arch)
             if whole < _FEWEST:
@@ -153,7 +153,7 @@ class PickingLayout:
 
     @property
     def px_per_mm(self) -> float:
-        """Return the pixels per mm of the layout."""
+        """Return the number of image pixels per mm of the layout."""
         return max(self.region[2] - self.region[0], 1.0) / _TEETH_MM
 
     def place(self, pixel: ArrayLike) -> Array:
@@ -172,7 +172,7 @@ class PickingLayout:
         return (float(x), float(y)) if -0.5 <= x <= width - 0.5 and -0.5 <= y <= height - 0.5 else None
 
     def scan_poses(self, scans: Mapping[str, Mesh], T_anatomical_skull: Array, side: str) -> dict[str, Array]:
-        """Return T_layout_scan (4, 4) of both arches: in front of the image, below the region, seen from a side."""
+        """Return T_layout_scan (4, 4) for both arches: in front of the image, below the region, a side facing the viewer."""
         top = float(self.place([self.region[0], self.region[3]])[1]) + _GAP_MM
         middle = float(self.place([(self.region[0] + self.region[2]) / 2, 0.0])[0])
         found = {}

@@ -57,7 +57,7 @@ class Plot:
 
 
 def bound_plot(rig: JawRig, axis: int) -> Plot:
-    """Plot the paper's outline, the bound's slice and the captured poses over d1 and d2 (axis 1) or d3 (axis 2)."""
+    """Plot the outline of the paper, a slice of the bound, and captured poses: d2 (axis 1) or d3 (axis 2) over d1."""
     name = ("", "d1d2", "d1d3")[axis]
     corners = rig.arrays[f"polygon_{name}"]
     rings = np.split(corners, np.cumsum(rig.arrays[f"polygon_{name}_counts"])[:-1].astype(int))

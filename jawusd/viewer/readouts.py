@@ -67,14 +67,14 @@ def captured_d(rig: JawRig) -> Array:
 
 
 def habitual_path(rig: JawRig, samples: int = 60) -> Array:
-    """Return the landmarks along plain opening (d2 = d3 = 0), anatomical frame [mm], shape (samples, 5, 3)."""
+    """Return the landmarks along pure opening (d2 = d3 = 0), anatomical frame [mm], shape (samples, 5, 3)."""
     opening = np.linspace(0.0, float(rig.d_range[0, 1]), samples)
     return landmark_places(rig, np.stack([opening, np.zeros(samples), np.zeros(samples)], axis=1))
 
 
 def border_path(rig: JawRig, axis: int, samples: int = 40) -> Array:
     """Return the outline of the bound over d1 and d2 (axis 1) or d1 and d3 (axis 2), parameters (n, 3) [mm]."""
-    # Samples are denser at both ends of the opening, where the bound narrows.
+    # Samples are denser at both ends of the opening range, where the bound narrows.
     low, high = rig.d_range[0]
     opening = low + (high - low) * 0.5 * (1.0 - np.cos(np.linspace(0.0, np.pi, samples)))
     ends = rig.ranges(opening)

@@ -78,10 +78,10 @@ class _Closable(Protocol):
 
 
 class PageServer(ABC):
-    """Server with one page per visitor; `pages` are the open pages by client number, `url` is the address to open."""
+    """Server with one page per visitor; `pages` are the open pages by client number; `url` is the address to open."""
 
     def __init__(self, name: str, host: str, port: int) -> None:
-        """Start serving on a port; 0 means any free port, and a port in use means the next free one.
+        """Start serving on a port: 0 selects any free port; instead of a port in use, the next free one is taken.
 
         Raises:
             OutputError: the address does not belong to this machine.
@@ -91,7 +91,7 @@ class PageServer(ABC):
         _check_address(host)
         with contextlib.redirect_stdout(sys.stderr):  # viser prints a greeting, but stdout is for results
             self._server = _LocalServer(host=host, port=port, label=name, verbose=False)
-        logging.getLogger("websockets.server").addFilter(_WITHOUT_TRACEBACK)  # no effect if added before
+        logging.getLogger("websockets.server").addFilter(_WITHOUT_TRACEBACK)  # a filter is added only once
         self._server.get_event_loop().set_exception_handler(_report_task)
         set_theme(self._server.gui)
         self._server.on_client_connect(self._connected)

@@ -49,7 +49,7 @@ class Work:
 
 
 class Session:
-    """Posing, dragging and keying of a rig by one visitor; with `keep_valid` sliders stay inside the bound."""
+    """Posing, dragging and keying of a rig by one visitor; with `keep_valid`, sliders stay inside the bound."""
 
     def __init__(self, rig: JawRig, fps: float) -> None:
         """Start in occlusion and without keys."""

@@ -76,7 +76,7 @@ class ViewedCapture:
         [int, tuple[Array, Array] | None, Look, Callable[[NDArray[np.uint8]], None] | None], NDArray[np.uint8]
     ]
     wall_px: tuple[int, int]
-    # maps (camera, frame) to the region of the teeth in its masks, None without masks
+    # maps (camera, frame) to the region of the teeth in the camera's masks; None without masks
     teeth_region: Callable[[str, int], Region | None]
     # fits T_world_upper and T_world_lower (4, 4) to picks, and returns them with the names of inconsistent picks;
     # raises a JawusdError
@@ -130,7 +130,7 @@ def is_solid(mesh: Mesh) -> bool:
     count = len(mesh.vertices)
     closed = np.isin(starts * count + ends, ends * count + starts).all()
     corners = mesh.vertices[mesh.faces]
-    volume = np.linalg.det(corners - mesh.vertices.mean(axis=0)).sum()  # six times the volume
+    volume = np.linalg.det(corners - mesh.vertices.mean(axis=0)).sum()  # six times the signed volume
     return bool(closed and volume > 0)
 
 
