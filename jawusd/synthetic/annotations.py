@@ -25,7 +25,7 @@ _FINE = 4
 # Minimum distance of a pick from the image border, and minimum cosine between viewing ray and normal (70 degrees).
 _BORDER_PX = 10.0
 _FACING = 0.35
-# Minimum distance in front of a point at which a surface occludes it.
+# Minimum distance of a surface in front of a point for the surface to occlude the point.
 _CLEARANCE_MM = 0.05
 _TIPS_PER_TOOTH = 6
 

@@ -46,13 +46,13 @@ _SCANS = ("upper_teeth", "lower_teeth", "mandible", "skull")
 _PICKS = 4
 _PICK_NOISE_PX = 1.0
 _PICTURES_PER_BOARD = 2
-# Sensor noise: standard deviation [grey levels of 255], and number of patterns; every image gets a randomly shifted
+# Sensor noise: standard deviation [gray levels, 0..255], and number of patterns; every image gets a randomly shifted
 # copy of one pattern.
 _SENSOR_NOISE = 1.3
 _NOISE_PATTERNS = 5
 
 
-_IMAGE_S = 0.93  # time per image on two cores without a GPU; 14 minutes for the 900 images of the default capture
+_IMAGE_S = 0.93  # rendering time per image on two cores without a GPU; the default capture has 900 images
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,7 @@ def write_demo(folder: str | os.PathLike[str], config: DemoConfig, progress: Pro
     folder = Path(folder)
     person = Person(config.seed)
     cameras = build_cameras(config.size_px)
-    with Renderer(cameras) as renderer:  # raises before any file is written if there is no OpenGL
+    with Renderer(cameras) as renderer:  # without OpenGL, raises before a file is written
         anatomy = build_anatomy(person)
         take = perform(person, anatomy.occlusion, config.frames, _OFFSETS, config.seed)
         recorder = _Recorder(folder, config, cameras, renderer, progress)

@@ -44,12 +44,12 @@ class ArchShape:
 class DentalArch:
     """One dental arch with gum, in the scan frame."""
 
-    mesh: Mesh  # crown vertices, red and green, then gum vertices, grey
+    mesh: Mesh  # crowns (coloured red and green), then gum (gray)
     tooth: NDArray[np.int8]  # tooth number of each vertex, 1..7 left, -1..-7 right from the midline, 0 gum, shape (V,)
 
 
 class ArchLine:
-    """Planar curve through the contact points over signed arc length from the midline, positive to the left."""
+    """Planar curve through the contact points; its parameter is the arc length from the midline, positive left."""
 
     def __init__(self, shape: ArchShape) -> None:
         """Compute the curve for the shape of an arch."""
@@ -88,7 +88,7 @@ def build_arch(forms: tuple[CrownForm, ...], shape: ArchShape, cusp_slope: float
 
     Args:
         forms: tooth kinds from the first incisor to the second molar.
-        cusp_slope: drop of the cusps per mm.
+        cusp_slope: slope of the cusps [-], height lost per mm of distance from the tip.
         upper: whether to mirror the arch downwards.
         seed: seed of the positions and irregularities of the teeth, which do not depend on the heights of the tips.
     """

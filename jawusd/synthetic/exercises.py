@@ -107,7 +107,7 @@ def smooth_noise(rng: np.random.Generator, n_frames: int, frames: float, n: int)
 
 
 def _faster(curve: Array, tempo: float) -> Array:
-    """Resample a control curve (F, 3) to fewer frames."""
+    """Resample a control curve (F, 3) to a smaller number of frames."""
     at = np.arange(0.0, len(curve) - 1.0, tempo)
     return np.stack([np.interp(at, np.arange(len(curve)), column) for column in curve.T], -1)
 

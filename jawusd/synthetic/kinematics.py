@@ -144,7 +144,7 @@ def _coupling(joint: Joint, opening: Array) -> Array:
 
 
 def _protrusive_range(joint: Joint, opening: Array, share: Array, protrusion: Array) -> Array:
-    """Return the range of forward slides of both condyles [mm] or, for negative protrusion, of backward slides."""
+    """Return the largest forward slide of both condyles [mm] or, for negative protrusion, the backward slide."""
     forward = joint.protrusion_max_mm * (1.0 - 0.85 * np.clip(share, 0.0, 1.1))
     hinge = joint.hinge_share * joint.slide_open_mm * share * (1.0 - smoothstep((opening - 0.3) / 0.5))
     backward = joint.retrusion_max_mm * (1.0 - np.clip(opening, 0.0, 1.0)) + 0.15 + hinge
@@ -190,7 +190,7 @@ def _guided(joint: Joint, pitch: Array, slides: Array, forward_mm: Array, differ
 
 
 def _glide(guidance: Array, distance_mm: Array) -> Array:
-    """Return the drop of the lower incisors over a glide distance [mm]: steep first, flatter up to edge-to-edge."""
+    """Return the drop of the lower incisors [mm] at a glide distance [mm]: steep at first, then flatter."""
     steep, flat, transition_mm = guidance
     return flat * distance_mm + (steep - flat) * transition_mm * -np.expm1(-distance_mm / transition_mm)
 

@@ -129,7 +129,7 @@ class Envelope:
 
 
 def _asymmetric(rng: np.random.Generator, value: float, relative: float) -> Array:
-    """Draw a left and a right value around a common value."""
+    """Draw random left and right values around a given value."""
     return value * (1.0 + relative * rng.uniform(-1.0, 1.0, 2))
 
 

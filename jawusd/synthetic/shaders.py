@@ -80,7 +80,7 @@ out vec2 at;
 void main() { at = 0.5 * in_corner + 0.5; gl_Position = vec4(in_corner, 0.0, 1.0); }
 """
 
-# Contact shadows: fraction of the neighbourhood in front of a point.
+# Contact shadows: fraction of the neighbourhood of a point that lies in front of it.
 SHADOW_FRAGMENT = """
 #version 330
 in vec2 at;

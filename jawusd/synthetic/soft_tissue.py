@@ -117,7 +117,7 @@ class Face:
         reach = np.ones(self.rows)
         reach[-_SKIN_ROWS:] = np.linspace(1.0, 0.75, _SKIN_ROWS)
         weight = self._follow * reach[:, None]
-        weight[0] = 0.4  # the ring at the throat stays closed
+        weight[0] = 0.4  # equal for all points of the ring at the throat, so that it does not open
         weight = weight[..., None]
         moved = transform_points(np.asarray(T_skull_mandible, dtype=np.float64), rest.reshape(-1, 3))
         return (rest + weight * (moved.reshape(rest.shape) - rest)).reshape(-1, 3)

@@ -78,7 +78,7 @@ def build_cameras(size_px: tuple[int, int]) -> list[Camera]:
 
 
 def board() -> Surface:
-    """Return the chessboard with a white rim: its origin is the centre, x runs along the columns, it faces -z."""
+    """Return the chessboard with a white rim; origin at its centre, x along the columns, facing -z."""
     columns, rows = BOARD_COLUMNS + 3, BOARD_ROWS + 3
     vertices, colors = [], []
     for i in range(rows):
@@ -194,7 +194,7 @@ def _head(n: int, rng: np.random.Generator) -> Array:
 
 
 def _lips(controls: Array, phase: NDArray[np.str_], rng: np.random.Generator) -> list[LipState]:
-    """Return the shape of the lips in every frame: retracted to show the teeth, but less so in chewing and speech."""
+    """Return the shape of the lips in every frame: retracted to show the teeth, less so during chewing and speech."""
     drift = _drift(len(controls), rng, 4)
     relaxed = smoothed(np.isin(phase, ["chew", "speech"]).astype(np.float64)[:, None])[:, 0]
     wide = smoothstep(controls[:, 0])

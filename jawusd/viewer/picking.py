@@ -172,7 +172,7 @@ class PickingLayout:
         return (float(x), float(y)) if -0.5 <= x <= width - 0.5 and -0.5 <= y <= height - 0.5 else None
 
     def scan_poses(self, scans: Mapping[str, Mesh], T_anatomical_skull: Array, side: str) -> dict[str, Array]:
-        """Return T_layout_scan (4, 4) for both arches: in front of the image, below the region, a side facing the viewer."""
+        """Return T_layout_scan (4, 4) by arch: in front of the image, below the region, `side` facing the viewer."""
         top = float(self.place([self.region[0], self.region[3]])[1]) + _GAP_MM
         middle = float(self.place([(self.region[0] + self.region[2]) / 2, 0.0])[0])
         found = {}
