@@ -63,7 +63,7 @@ class Library:
 
     folder: Path  # resolved path of the folder
     entries: tuple[Entry, ...]  # rigs in the folder, sorted by path
-    skipped: dict[str, str]  # reasons why files could not be read, by path
+    skipped: dict[str, str]  # by path of a file that could not be read: the reason
     reread: int  # number of new or changed rigs
 
     def find(self, name: str) -> Entry:
@@ -82,7 +82,7 @@ class Library:
         return found[0]
 
     def search(self, text: str) -> tuple[Entry, ...]:
-        """Return the rigs whose name or path contains a text, ignoring case."""
+        """Return the rigs whose name or path contains a given text, ignoring case."""
         return tuple(e for e in self.entries if text.lower() in e.actor.lower() or text.lower() in e.path.lower())
 
 

@@ -6,7 +6,7 @@ incisal point. The resulting pose is the rigid motion that best fits the displac
 
 The weight of a library subject decreases with the distance between its landmarks and those of the target subject. The
 bandwidth of the weights and the expected error come from leave-one-out validation: each subject of the library is
-predicted from the others.
+predicted from the other subjects.
 """
 
 from __future__ import annotations

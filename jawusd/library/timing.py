@@ -36,7 +36,7 @@ def follow(original: Array, carried: Array, least: float) -> Array:
 
 
 def _zigzag(rising: Mask, wanted: Array) -> Array:
-    """Return the z (n,) nearest to ``wanted`` (n,) with z[i + 1] >= z[i] where ``rising`` (n - 1,), <= elsewhere."""
+    """Return values z (n,) nearest to ``wanted`` (n,) with z[i + 1] >= z[i] where ``rising`` (n - 1,), <= elsewhere."""
     cost = _Slopes()
     cost.add(wanted[0])
     limits = np.empty(len(rising))

@@ -37,10 +37,10 @@ def convert(source: str, target: str, fps: float) -> None:
 
 
 def _assign_takes() -> None:
-    """Assign to every object the take of an FBX file in which it moves.
+    """Assign to every object of an FBX file the take in which the object moves.
 
-    By default, Blender's FBX exporter writes every action for every object, such as the camera's action for the jaw;
-    the importer then assigns the first action.
+    By default, Blender's FBX exporter writes every action for every object, such as the camera's action for the jaw,
+    and the importer assigns the first of these actions to the object.
 
     Raises:
         ValueError: A mesh moves in several takes, so the choice is ambiguous.

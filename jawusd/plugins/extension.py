@@ -72,7 +72,7 @@ def packed_reader() -> str:
 
 
 def _collect(source: Path, modules: dict[Path, ast.Module]) -> None:
-    """Parse a module and the modules of jawusd that it imports; dependencies come first."""
+    """Parse a module and the jawusd modules that it imports; dependencies come first."""
     tree = ast.parse(source.read_text(encoding="utf-8"))
     for node in tree.body:
         if isinstance(node, ast.ImportFrom) and str(node.module).startswith("jawusd."):

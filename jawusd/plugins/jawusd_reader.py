@@ -53,7 +53,7 @@ _OPERATIONS = FloatOperations()
 
 
 class ReaderError(Exception):
-    """A file that is not a jaw rig, or is too new for this reader."""
+    """The file is not a jaw rig, or its version is too new for this reader."""
 
 
 def load(path: str, prim_path: str | None = None) -> Rig:
@@ -330,7 +330,7 @@ def decompose(T: Rows) -> tuple[Triple[float], tuple[float, float, float, float]
         (c - g, b + d, 1 - a + e - i, f + h),
         (d - b, c + g, f + h, 1 - a - e + i),
     )
-    # The candidate with the largest component is the most accurate.
+    # The quaternion candidate with the largest component is the most accurate.
     q = candidates[max(range(4), key=lambda k: candidates[k][k])]
     length = math.copysign(math.sqrt(sum(v * v for v in q)), q[0] if q[0] != 0 else 1.0)
     return (x, y, z), (q[0] / length, q[1] / length, q[2] / length, q[3] / length)

@@ -219,7 +219,7 @@ def unreal_keys(
 
     section = binding.add_track(unreal.MovieScene3DTransformTrack).add_section()
     section.set_range(min(keys), max(keys) + 1)
-    channels = section.get_all_channels()  # location x y z, rotation roll pitch yaw, scale x y z
+    channels = section.get_all_channels()  # channels: location x y z, rotation roll pitch yaw, scale x y z
     previous = None
     for frame, T in poses(rig, every_frame(keys), measured=measured).items():
         location, quaternion = unreal_pose(T, scale)

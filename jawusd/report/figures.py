@@ -81,7 +81,7 @@ def tracking_figure(tracks: Tracks) -> Figure:
 
 
 def model_figure(model: JawModel) -> Figure:
-    """Plot the jaw parameters of every frame, the distances of the poses to the model, and the margins to the bound."""
+    """Plot the jaw parameters of every frame, the distance of its poses from the model, and its margin to the bound."""
     rig = JawRig(model.arrays, model.meta)
     known = np.all(np.isfinite(model.d), axis=1)
     margin = np.full(len(model.d), np.nan)
@@ -136,7 +136,7 @@ def _mean_of_known(values: Array, axis: int) -> Array:
 
 
 def larger_magnitude(a: Array, b: Array) -> Array:
-    """Return the elementwise value with the larger magnitude, ignoring NaN."""
+    """Return, for each element, the value with the larger magnitude, ignoring NaN."""
     return np.where(np.isnan(a) | (np.abs(b) > np.abs(a)), b, a)
 
 
@@ -175,7 +175,7 @@ def draw_sync(curves: Mapping[str, LightCurve], offsets: Mapping[str, int] | Non
 
 
 def sync_figure(curves: Mapping[str, LightCurve], offsets: Mapping[str, int] | None, title: str) -> Figure:
-    """Return the figure of `draw_sync`: one row of plots as recorded and, if offsets are given, one row aligned."""
+    """Return the figure of `draw_sync`: one row of plots as recorded and, with offsets, a row of aligned plots."""
     rows: list[tuple[str, str, Mapping[str, int]]] = [("as recorded", "frame of each camera", dict.fromkeys(curves, 0))]
     if offsets is not None:
         rows.append(("aligned", "frame of the reference camera", offsets))

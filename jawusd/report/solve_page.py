@@ -110,7 +110,7 @@ def _name_lanes(axis: Axes, names: list[str]) -> None:
 
 
 def _label_frames(top: Axes, bottom: Axes, fps: float) -> None:
-    """Label a time axis: frames below the plots, seconds above."""
+    """Label a time axis: frame numbers below the plots, seconds above."""
     bottom.set_xlabel("frame of the reference camera")
     seconds = top.secondary_xaxis("top", functions=(partial(_scaled, factor=1 / fps), partial(_scaled, factor=fps)))
     seconds.set_xlabel("time [s]")
@@ -172,7 +172,7 @@ def solve_page(data: SolveReportData) -> str:
 
 
 def unobserved_runs(data: SolveReportData, solved: SolvedJaw) -> list[UnobservedRun]:
-    """Return the runs of consecutive frames in which an arch was not found; a run has a single state."""
+    """Return the runs of consecutive frames in which an arch was not found; all frames of a run have the same state."""
     frames, found = data.tracks.frames, []
     breaks = np.flatnonzero((np.diff(solved.state) != 0) | (np.diff(frames) != 1)) + 1
     for rows in np.split(np.arange(len(frames)), breaks):

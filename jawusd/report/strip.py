@@ -17,9 +17,9 @@ _WORDS = ("inside", "within tolerance", "invalid")
 
 
 def save_strip(path: Path, frames: Array, verdicts: Verdicts) -> None:
-    """Write a picture of verdicts over frames (F,): green inside, amber within the tolerance, red invalid.
+    """Write an image of verdicts on frames (F,): green is inside, amber within the tolerance, red invalid.
 
-    Below it are the margin to the bound and the distance to the model [mm].
+    Plots of the margin to the bound and of the distance from the model [mm] are below the strip.
 
     Raises:
         OutputError: the file cannot be written.

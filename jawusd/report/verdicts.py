@@ -95,8 +95,8 @@ def overall(verdicts: Iterable[Verdict]) -> str:
 def summary(verdicts: Iterable[Verdict]) -> BuildVerdict:
     """Return the worst grade, advice on what to do, and the checks with that grade and their limits.
 
-    The advice is ordered by grade, then by stage, since a fault affects the stages after it. All movements to record
-    are joined in one sentence.
+    The advice is ordered by grade, then by stage, since a fault affects the stages after it. The
+    movements to record are listed in one sentence.
     """
     verdicts = list(verdicts)
     grade = overall(verdicts)
@@ -201,8 +201,8 @@ def _track(tracks: Tracks) -> Verdict:
         elif one.kind in _WRONG_SCANS:
             todo = "Check that the scans are of this subject, complete, in mm and not mirrored."
             checks.append(Check("scans", one.message, "must match the masks", BAD, todo))
-    # False positives: 7 of 30 valid subjects (`population.py --persons 30 --seed 9500`), 3 of them with a true
-    # underbite.
+    # These checks flag 7 of 30 valid subjects, 3 of whom have a true underbite
+    # (`population.py --persons 30 --seed 9500`).
     for one in found:
         if one.severity == "warning" and one.kind not in _UNUSED | _WRONG_SCANS:
             told = one.line().removeprefix("warning: ")
@@ -288,7 +288,7 @@ def _bounds(data: ReportData) -> Verdict:
                 f"{_RECORD}slow circling at every opening.",
             )
         )
-    # The values of the experiments are used, so that the verdict agrees with the plot.
+    # Use the values of the experiments, so that the verdict agrees with the plot.
     warned = [w["message"] for w in meta.get("warnings", []) if w["code"] in _LACKING]
     lacks = data.experiments.coverage.sentences if data.experiments else warned
     checks += [Check("captured movements", sentence, _EXERCISES, LOOK, _movement(sentence)) for sentence in lacks]

@@ -18,7 +18,7 @@ SETTINGS = {
     "WM_OT_collada_export": {},
 }
 _CHANNELS = ("location", "rotation_quaternion")
-# Key under which the name of a property is stored that only this mandible has. FBX export assigns an action to every
+# Custom property with the name of a property that is unique to the mandible. FBX export assigns an action to every
 # object that has all channels of the action; a channel for the unique property prevents this.
 _OWN = "jawusd_own"
 _LINEAR = 1  # Blender's enum value for linear interpolation

@@ -166,7 +166,7 @@ def _object_of(prim_map: PrimMap, path: Sdf.Path) -> bpy.types.Object | None:
 
 
 def _nearest_object(prim_map: PrimMap, path: Sdf.Path) -> bpy.types.Object | None:
-    """Return the object created from a prim or, without one, from its nearest ancestor."""
+    """Return the object created from a prim or, if there is none, from its nearest ancestor."""
     return next((found for other in reversed(path.GetPrefixes()) for found in _objects(prim_map, other)), None)
 
 
@@ -287,7 +287,7 @@ def _install(*_: object) -> None:
     _poses.clear()
     for mandible in (found for found in bpy.data.objects if _ACTOR in found):
         if _drivers(mandible, (_OLD_FUNCTION,)):
-            with contextlib.suppress(vendored.JawusdError):  # the panel displays the error
+            with contextlib.suppress(vendored.JawusdError):  # the error is displayed by the panel
                 drive(mandible, mandible[_ACTOR])
         # Blender disables drivers whose function is missing; setting the expression makes it try again.
         for curve in _drivers(mandible, (_FUNCTION,)):

@@ -58,7 +58,7 @@ class JAWUSD_PT_sliders(bpy.types.Panel):
 
 
 class JAW_PT_export(bpy.types.Panel):
-    """Panel next to the export settings in the file browser that warns about motion that an export loses."""
+    """Panel beside the export settings in the file browser, with a warning about motion that an export loses."""
 
     bl_label = "Jaw"
     bl_space_type = "FILE_BROWSER"
