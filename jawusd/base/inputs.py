@@ -49,7 +49,7 @@ def why_unreadable(path: str | os.PathLike[str]) -> tuple[str, str] | None:
 
 
 def check_path(path: str | os.PathLike[str], error: type[JawusdError]) -> None:
-    """Check that OpenUSD can open a path: it needs UTF-8 without control characters.
+    """Check that OpenUSD can open a path, which must be UTF-8 without control characters.
 
     Raises:
         JawusdError: OpenUSD cannot open it; raised as an instance of `error`.
@@ -71,7 +71,7 @@ def check_path(path: str | os.PathLike[str], error: type[JawusdError]) -> None:
 
 
 def allow_folders(folders: Iterable[str | os.PathLike[str]]) -> None:
-    """Allow stages to reference files in these folders, in addition to those in the environment variable.
+    """Allow stages to reference files in the given folders, besides the folders in the environment variable.
 
     Subfolders are included. The folders of earlier calls are replaced.
     """

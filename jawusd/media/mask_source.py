@@ -47,7 +47,7 @@ def png_levels(files: Sequence[Path], is_other: Callable[[RawImage], bool] | Non
     try:
         return _png_levels_of_version(tuple(sample), versions, others, is_other)
     finally:
-        others.files = []  # names only, since the cache keeps this object, and a take has tens of thousands of files
+        others.files = []  # the cache keeps this object; free its list of up to tens of thousands of files
 
 
 def video_levels(path: Path) -> tuple[SourceLevels, Colour]:

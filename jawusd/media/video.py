@@ -26,8 +26,8 @@ from jawusd.media.timeline import Timeline
 
 _REENCODE = "Re-encode the video, for example: ffmpeg -i IN -c:v libx264 -crf 12 OUT.mp4."
 _CUT_OFF = "Copy the file again from the camera; repair an interrupted recording first."
-# Decoders, by codec, that read the alpha channel of WebM; this channel is in a second stream, as a flag in the metadata
-# indicates.
+# Decoders, by codec, that read the alpha channel of WebM; the channel is in a second stream, indicated by a
+# flag in the metadata.
 _ALPHA_DECODERS = {"vp8": "libvpx", "vp9": "libvpx-vp9"}
 # Decoders that report damage with any number of threads. Decoders with error concealment (H.264, MPEG-4) mark an image
 # as damaged only after threads have returned it: with eight threads, a third of the damage in H.264 was missed.

@@ -118,7 +118,7 @@ class PlateWriter:
         write_bytes_atomic(path, cv2.imencode(".jpg", plate, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1].tobytes())
 
     def write_light(self, path: str | os.PathLike[str], image: NDArray[np.float32]) -> None:
-        """Undistort linear light (h, w, 3) RGB and write it as EXR of half floats, ZIP compressed.
+        """Undistort a linear-light RGB image (h, w, 3) and write it as a ZIP-compressed EXR of half floats.
 
         Raises:
             OutputError: the file cannot be written.

@@ -262,7 +262,7 @@ def _maxilla(joint: JointShape, arch: tuple[float, float]) -> tuple[Array, Faces
 
 
 def _upper_skull(joint: JointShape) -> list[tuple[Array, Faces]]:
-    """Return braincase, brow, and the sides of the nose and outer rims of the orbits below it; mean adult sizes."""
+    """Return braincase and brow, and below them sides of the nose and outer rims of the orbits; mean adult sizes."""
     wide = joint.condylar_distance_mm / 100.0
     y, z = joint.condyles[:, 1:].mean(0)
     # columns: height, forward position of the middle, half width, half length; rows: from the base to the crown

@@ -117,7 +117,7 @@ def solid(corners: Array, up: float, box: Array, step_mm: float = STEP_MM) -> So
         step_mm: step of the distance grid; distances between its points are interpolated linearly.
     """
     outer, entering = outer_faces(corners, up)
-    # Interpolated distances up to FARTHEST_MM need exact values up to one cell diagonal beyond it.
+    # Interpolating distances up to FARTHEST_MM requires exact values up to one cell diagonal farther away.
     grid = distance_grid(corners, outer, box, step_mm, up, FARTHEST_MM + 3.0**0.5 * step_mm)
     near = ((corners <= box[1]) & (corners >= box[0])).all(axis=2).any(axis=1)
     return Solid(grid, in_boxes(surface_points(corners[outer & near], _SAMPLE_MM)), entering)

@@ -253,7 +253,7 @@ def draw_depth_labels(
 
 @numba.njit(types.uint64(types.uint64), nogil=True, cache=True)
 def _popcount(x: np.uint64) -> np.uint64:
-    """Count the set bits of a word (H. S. Warren, Hacker's Delight, fig. 5-2; LLVM turns it into popcnt)."""
+    """Count the set bits of a word (H. S. Warren, Hacker's Delight, fig. 5-2; LLVM compiles this to popcnt)."""
     x = x - ((x >> _ONE) & np.uint64(0x5555555555555555))
     x = (x & np.uint64(0x3333333333333333)) + ((x >> np.uint64(2)) & np.uint64(0x3333333333333333))
     x = (x + (x >> np.uint64(4))) & np.uint64(0x0F0F0F0F0F0F0F0F)

@@ -17,7 +17,7 @@ from jawusd.formats.mesh import Mesh
 # millimetre and cause ripples of a few hundredths.
 _SCALE_MM = 0.35
 _MOST_ROUNDS = 12
-# Creases are found from vertex normals up to this edge length, and from face angles above twice this length.
+# Mean edge length at a vertex up to which creases are found from normals; above twice this length, from face angles.
 _FINE_MM = 0.4
 _SEEN_MM = 0.75  # cell size of the test for visibility from above
 

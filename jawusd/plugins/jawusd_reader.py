@@ -275,7 +275,7 @@ class Rig:
     def ranges(self, d1: float, d2: float = 0.0, d3: float = 0.0) -> tuple[Pair, Pair]:
         """Return the valid (min, max) of d2 at this d3, and of d3 at this d2 [mm]; (nan, nan) if no value is valid.
 
-        The bound ends some tenths of a millimetre before the limits of d1; beyond its end, the last valid opening is
+        The bound ends a few tenths of a millimetre before the limits of d1; beyond its end, the last valid opening is
         used.
         """
         d1 = self._nearest_opening(d1, d2, d3)

@@ -31,7 +31,7 @@ _LAST_GATES_PX = (2.0,)
 _TRIAL_GATES_PX = (8.0, 6.0)  # residual gates of the short trial alignments of a search [px]
 # Longest intervals between steps [frames] that count as no dropped frame, and as one dropped frame.
 _NEXT_FRAMES, _STEADY_FRAMES = 1.5, 2.5
-_FIRST_ROUNDS = 3  # number of refinements of the start, whose error may be some tenths of a millimetre
+_FIRST_ROUNDS = 3  # number of refinements of the start, whose error may be a few tenths of a millimetre
 # Fractions of the usual matched contour below which an arch is lost, and below which a lost arch stays lost.
 _LOST, _AGAIN = 0.33, 0.5
 # number of frames since the last step above which an arch must fit as well as a recovered one
@@ -78,7 +78,7 @@ class RigTracker:
         self._failed = self._frame = 0
 
     def begin(self, cut: Cut, pose: Pose) -> FrameFit:
-        """Learn colours from a first frame at a pose accurate to some tenths of a millimetre; return the frame fit."""
+        """Learn colours from a first frame at a pose accurate to a few tenths of a millimetre; return the frame fit."""
         arches = self._coordinates.arches(pose)
         self._colours.begin(cut(arches), arches)
         sigma = LARGEST_SIGMA * np.r_[[min(1.0, self._head)] * 6, [1.0] * 3]

@@ -21,7 +21,7 @@ from jawusd.tracking.region.effort import THOROUGH
 from jawusd.tracking.region.search import InstantViews, PoseSearch, fitting_share
 from jawusd.tracking.sequence.history import MotionPredictor
 
-_FIRST_ROUNDS = 3  # number of refinements of the start, whose error may be some tenths of a millimetre
+_FIRST_ROUNDS = 3  # number of refinements of the start, whose error may be a few tenths of a millimetre
 # Fractions of the usual matched contour below which wider residual gates are tried, the jaw is searched for, a lost
 # arch stays lost, and an arch is lost. The usual matched contour is the median over recent frames, but at least
 # `_LEAST_USUAL` times its value in the first frame, so that slowly closing lips do not redefine it.
@@ -72,7 +72,7 @@ class RegionTracker:
         self._first_share = np.zeros(2)
 
     def begin(self, cut: Cut, poses: Array) -> RegionPose:
-        """Learn the colours of a first frame at poses accurate to some tenths of a millimetre, and refine the poses."""
+        """Learn the colours of a first frame at poses accurate to a few tenths of a millimetre, and refine them."""
         self._colours.begin(cut(poses), poses)
         for _ in range(_FIRST_ROUNDS):
             pictures = cut(poses)

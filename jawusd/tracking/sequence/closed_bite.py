@@ -3,7 +3,7 @@
 The scans are exported in occlusion, so T_upper_lower is the identity with closed teeth, except for three errors: errors
 of the scans' registration, outline biases common to all frames, and the noise of single frames. The spread of each
 error is known, so linear least squares attributes the measured deviation to them. Most registrations are accurate to
-some hundredths of a millimetre, but outliers are large: a Student distribution is therefore assumed for registration
+a few hundredths of a millimetre, but outliers are large: a Student distribution is therefore assumed for registration
 errors, and fitted by reweighting (Lange, Little & Taylor 1989).
 """
 

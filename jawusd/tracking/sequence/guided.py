@@ -31,7 +31,7 @@ from jawusd.tracking.sequence.history import History
 #: with masks.
 MakeViews = Callable[[int, Array, int], Sequence[View]]
 
-# number of rounds: picks are some tenths of a millimetre off, and each round removes most of the remaining error
+# number of rounds: picks are a few tenths of a millimetre off, and each round removes most of the remaining error
 _FIRST_ROUNDS = 3
 
 
