@@ -29,7 +29,7 @@ _CLEAR_MISFIT = 0.2  # maximum misfit of a photograph whose bite initialises the
 _GATE_MM, _MOST_MISFIT = 0.5, 0.45  # gate of the final misfit, and maximum final misfit of scans of the same subject
 # Minimum ratio of the misfit with the opposite mirroring to that with the chosen one, for a clear choice.
 _SAME_HAND = 1.15
-_APART_MM = 1.5  # maximum plausible distance between the bite from one photograph and the bite from all
+_APART_MM = 1.5  # maximum plausible distance between the bite from one photograph and that from all photographs
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +72,7 @@ def align_photographs(
 def _starts(
     drawings: Sequence[Drawing], scans: Sequence[Scan], contact: Contact, progress: Callable[[str, int, int], None]
 ) -> list[PhotoStart]:
-    """Return the initial pose of each photograph; the bite found in the first photograph is used for the others."""
+    """Return the initial pose of each photograph; the bite found first initialises the other photographs."""
     usual = typical_bites(scans)
     leads: list[tuple[int, PhotoStart]] = []
     for k, drawing in enumerate(drawings):

@@ -160,7 +160,7 @@ def outlines_of(
 
 
 def _ends(depth: NDArray[np.float32], labels: NDArray[np.uint8]) -> tuple[Array, Array, Array, Array]:
-    """Return the ends of teeth along pixel rows: column and row of the end, and column and row of its tooth pixel."""
+    """Return where teeth end along pixel rows: column and row of the boundary, and of the tooth pixel beside it."""
     rows, columns = np.nonzero(labels[:, 1:] != labels[:, :-1])
     right_is_near = depth[rows, columns + 1] > depth[rows, columns]
     # If gum, which has number 0, is in front, the outline belongs to the tooth behind it.

@@ -19,7 +19,7 @@ from jawusd.photographs.solve import Aligner, Bite, Contact, Photo, PhotoPose
 from jawusd.tracking.contour.scan import Scan, thinned
 
 _PX_PER_MM = 2.5
-_DISTANCE_MM = 200.0  # typical camera distance of dental photographs
+_DISTANCE_MM = 200.0  # typical distance from camera to teeth in dental photographs
 # Position of the front teeth's edges relative to the centre of rotation of the views.
 _FRONT_MM = np.array([0.0, 0.0, 15.0])
 _YAW = np.radians(np.arange(-75, 76, 15.0))
@@ -155,7 +155,7 @@ def _facing(turn: tuple[float, float, float]) -> Array:
 
 
 def _drawn_spectra(drawing: Drawing, size: int) -> Iterator[tuple[float, bool, NDArray[np.complex128], float]]:
-    """Yield per candidate: field of view [mm], whether mirrored, spectra by direction bin, number of points."""
+    """Yield for each candidate: field of view [mm], whether mirrored, spectra by direction bin, number of points."""
     for mirrored in (False, True):
         lines = drawing.mirrored() if mirrored else drawing
         middle = 0.5 * (np.array(drawing.size_px) - 1.0)

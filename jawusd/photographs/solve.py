@@ -50,7 +50,7 @@ class PhotoPose:
     distortion: float  # k1 in x (1 + k1 r^2), where r is the distance from the image centre over half the image width
 
     def stepped(self, centre: Array, step: Array) -> PhotoPose:
-        """Return the pose after a step (8,) of the unknowns; `centre` of the upper teeth in the camera frame [mm]."""
+        """Return the pose after a step (8,) of the unknowns; `centre` is that of the upper teeth, camera frame [mm]."""
         pose = orthonormalise(motion_about(centre, step[:6]) @ self.T_cam_upper)
         pose[2, 3] += centre[2] * np.expm1(step[6])
         return PhotoPose(pose, self.focal_px * float(np.exp(step[6])), self.distortion + float(step[7]))

@@ -69,7 +69,7 @@ def draw_crowns(scans: tuple[ScanSurface, ScanSurface], poses: Array, camera: Ca
 
 
 def _signed_distance(region: Mask) -> NDArray[np.float32]:
-    """Return the signed distance to a region's outline, positive inside [px]; large and negative if it is empty."""
+    """Return the signed distance to a region's outline, positive inside [px]; a large negative value if empty."""
     if not region.any():
         return np.full(region.shape, -1e3, np.float32)
     inner = cv2.distanceTransform(region.astype(np.uint8), cv2.DIST_L2, 5)
@@ -199,7 +199,7 @@ def learn_colours(
 
 
 def excess_odds(rgb: NDArray[np.uint8], model: ColourModel, config: SegmentationConfig) -> NDArray[np.float32]:
-    """Return the log-odds that pixels are tooth, from colour alone and minus the required threshold, shape (h, w)."""
+    """Return the log-odds that pixels are tooth, from colour alone, minus the required threshold, shape (h, w)."""
     demanded = model.surroundings_quantile(config.surroundings_share) + config.doubt
     return model.log_odds(rgb) - np.float32(np.clip(demanded, *config.doubt_range))
 

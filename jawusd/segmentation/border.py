@@ -34,8 +34,8 @@ def refine_borders(
     Pixels along the border are reclassified by the local colours on both sides. The colours learned over the take
     determine which parts are teeth, but not their exact borders, since the midpoint between tooth colour and
     surrounding colour varies locally. Fisher's discriminant between the local means determines the border (local region
-    statistics, Lankton & Tannenbaum 2008). Where the two colours are too similar, the border is invisible and stays
-    unchanged; parts with hardly any visible border are discarded.
+    statistics, Lankton & Tannenbaum 2008). Where the two colours are too similar, the border is invisible and is
+    not moved; parts with hardly any visible border are discarded.
     """
     colours = _blurred(log_chroma(rgb), config.border_blur_px)
     band, window = config.border_band_mm * px_per_mm, 2 * round(config.border_side_mm * px_per_mm) + 1

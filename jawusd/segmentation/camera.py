@@ -42,7 +42,7 @@ class Segment:
     expected: Expectation
 
     def only(self, arches: Mask) -> Segment:
-        """Return the segmentation with the masks of selected arches only, given a boolean array, shape (2,)."""
+        """Return the segmentation with the masks of only those arches that are true in `arches`, shape (2,)."""
         if arches.all():
             return self
         masks = np.where(arches[:, None, None], self.masks, np.uint8(0))
@@ -174,7 +174,7 @@ class CameraSegmenter:
 
 
 def _overlap(shares: NDArray[np.float32], drawn: NDArray[np.float32]) -> float:
-    """Return the intersection over union of a segmentation and its annotation, in the arch with the lower value."""
+    """Return the intersection over union of a segmentation and its annotation, for the arch in which it is lower."""
     a, b = shares > 0.5, drawn > 0.5
     return float(((a & b).sum((1, 2)) / np.maximum((a | b).sum((1, 2)), 1)).min())
 

@@ -114,7 +114,7 @@ class KeyMasks:
                 raise CaptureError(
                     f"the strokes are {gray.shape[1]} x {gray.shape[0]} px; the images are {size[0]} x {size[1]} px.",
                     path=path,
-                    hint="Draw them over a frame of the video at its original size.",
+                    hint="Draw the strokes over a frame of the video at its original size.",
                 )
             known = np.where(np.abs(gray.astype(int) - _UNKNOWN) > 64, 255, 0).astype(np.uint8)
             return Key(np.where(gray > _UNKNOWN, 255, 0).astype(np.uint8) & known, known, False)
@@ -130,7 +130,7 @@ def _is_strokes(picture: RawImage) -> bool:
 def write_sheet(
     path: Path, shown: Sequence[tuple[str, int, str]], videos: Mapping[str, ClipSource | Path], folder: Path
 ) -> None:
-    """Write a PNG with one tile per (camera, own frame, remark), in which both arches are outlined.
+    """Write a PNG with one tile per (camera, frame of this camera, remark), in which both arches are outlined.
 
     Raises:
         CaptureError: an image or mask cannot be decoded.

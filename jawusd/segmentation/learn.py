@@ -15,7 +15,7 @@ from jawusd.segmentation.border import refine_borders
 from jawusd.segmentation.colours import ColourModel, SegmentationConfig
 from jawusd.segmentation.picture import Window
 
-_FACTORS = (0.5, 2.0)  # factors by which the weights are multiplied, one weight at a time
+_FACTORS = (0.5, 2.0)  # factors that are tried for each weight, one weight at a time
 _NUMBERS = ("border", "place_per_mm", "rows_per_mm")
 _DOUBTS = (-1.0, 1.0)  # candidate increments of `doubt`
 _WIDER = np.arange(-6, 7) * 0.05  # candidate outward shifts of the outlines, in widths of the soft border

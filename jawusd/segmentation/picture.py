@@ -20,7 +20,7 @@ _NODE_PX = 8  # spacing of the grid on which the undistortion map is computed
 _CHUNK = 16  # number of frames that are buffered when reading backwards; 50 MB per full HD camera
 
 Pictures: TypeAlias = "dict[str, ColourPicture | None]"
-_Frames = range  # the built-in type, since `range` is also a method of the class below
+_Frames = range  # alias of the built-in type, because a class below has a method `range`
 
 
 @dataclass(frozen=True, eq=False)

@@ -31,7 +31,7 @@ _ROWS_APART, _LEAST_PART, _AS_BRIGHT, _LIKE = 1.0, 0.02, 0.65, 0.5
 # Candidate lines between the arches: tilts relative to half the width, sags relative to the height, and minimum
 # fraction of the tooth pixels on each side.
 _TILTS, _SAGS, _LEAST_SHARE = np.linspace(-0.3, 0.3, 21), np.linspace(-0.4, 0.4, 13), 0.2
-_LINE_PX = (-1, 0, 1)  # offsets of the pixel rows around a line that are averaged when testing for a gap
+_LINE_PX = (-1, 0, 1)  # offsets from a line of the pixel rows that are averaged to test for a gap
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,7 +116,7 @@ def _teeth(toothlike: Array, redness: Array) -> tuple[Mask, float] | None:
 
 
 def _distance(away: Mask) -> NDArray[np.float32]:
-    """Return the city-block distance of every pixel from the nearest pixel outside `away` [px]."""
+    """Return the city-block distance of every pixel from the nearest false pixel of `away` [px]."""
     return np.asarray(cv2.distanceTransform(away.astype(np.uint8), cv2.DIST_L1, 3), np.float32)
 
 
