@@ -167,7 +167,7 @@ def animate(
     emit_motion(out, rate, motion, changes, as_json)
 
 
-_CLAMPED_MM = 0.005  # minimum distance that is listed; smaller ones would be printed as 0.00
+_CLAMPED_MM = 0.005  # minimum distance for a frame to be listed; smaller distances would be printed as 0.00
 
 
 def arkit_fit(
@@ -288,7 +288,9 @@ def rate_of(rig: Path, prim: str | None) -> float:
     from jawusd.rig import describe
 
     if rig.suffix.lower() not in USD_SUFFIXES:
-        raise typer.BadParameter("is needed: neither the jaw nor the rig states a rate.", param_hint="--jaw-fps")
+        raise typer.BadParameter(
+            "is needed: neither the jaw motion nor the rig states a frame rate.", param_hint="--jaw-fps"
+        )
     return float(describe(rig, prim)["fps"])
 
 
@@ -335,8 +337,8 @@ def _by_skin(rig: JawRig, shapes: BlendShapes, source: Path, path: Path) -> Arra
     _check_actor(rig, skin.actor, path)
     if skin.meta.get("names") != list(shapes.names):
         raise FormatError(
-            f"has {len(shapes.names)} blend shapes; {path.name} was learned from {skin.columns} columns with other "
-            "names or in another order.",
+            f"has {len(shapes.names)} blend shapes; {path.name} was learned from {skin.columns} columns with different "
+            "names or in a different order.",
             path=source,
         )
     return skin(shapes.weights).d

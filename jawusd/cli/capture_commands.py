@@ -98,7 +98,7 @@ def sync(
             refuse_existing(path, force)
     single = len(clips) == 1
     if single and reference is not None:
-        raise typer.BadParameter("--reference is for clips; a capture names its reference in [sync].")
+        raise typer.BadParameter("--reference applies only to clips; a capture names its reference camera in [sync].")
     capture = open_capture(clips[0], allow_outside=allow_outside) if single else None
     videos = {c.name: c.clip for c in capture.cameras if c.clip} if capture else _named(clips)
     if reference is not None and reference not in videos:
@@ -127,7 +127,7 @@ def _named(clips: list[Path]) -> dict[str, Path]:
     short = {clip.stem: clip for clip in clips}
     named = short if len(short) == len(clips) else {str(clip): clip for clip in clips}
     if len(named) < len(clips):
-        raise typer.BadParameter("a clip is given twice.")
+        raise typer.BadParameter("the same clip is given twice.")
     return named
 
 

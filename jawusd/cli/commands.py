@@ -114,7 +114,7 @@ class _Formatter(Protocol):
     def write_dl(self, rows: Sequence[tuple[str, str]]) -> None: ...
 
 
-# Names shown in help for typer's types. Options with several values state their own.
+# Names shown in help for typer's types. Options with several values have individual names.
 _KINDS = {"path": "PATH", "str": "TEXT", "int": "N", "int range": "N", "float": "NUMBER", "float range": "NUMBER"}
 
 

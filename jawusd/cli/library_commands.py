@@ -59,7 +59,7 @@ def retarget(
     elif landmarks and library_folder and not any((anim, source, target, fps)):
         _personal(landmarks, library_folder, use, out or Path("model.npz"), force, as_json)
     else:
-        raise typer.BadParameter("give either ANIM, --from and --to, or --landmarks and --library.")
+        raise typer.BadParameter("give either ANIM with --from and --to, or --landmarks with --library.")
 
 
 def _retarget_motion(

@@ -45,7 +45,7 @@ def _root(
 
         say(f"jawusd {__version__}")
         raise typer.Exit
-    global _verbose  # needed by `main`, which prints errors after the context has ended
+    global _verbose  # used by `main` to print errors after the context of the command has ended
     _verbose = verbose
     if verbose:
         import faulthandler
@@ -62,10 +62,10 @@ def main() -> None:
     """Run the command line and exit: 0 success, 1 negative result, 2 wrong usage, 3 and above by error family."""
     if (
         "PXR_WORK_THREAD_LIMIT" not in os.environ
-    ):  # OpenUSD reads this on loading; rigs are too small to gain from threads
+    ):  # OpenUSD reads this variable when loaded; rigs are too small to gain from threads
         os.environ |= {"PXR_WORK_THREAD_LIMIT": "1", "TF_ENV_SETTING_ALERTS_ENABLED": "0"}
-    # This must be set before numpy is loaded. Multi-threaded sums differ in their last bits between machines, which
-    # changes fits by micrometres. The matrices are too small to gain from threads.
+    # Numpy reads the number of threads when it is loaded. Multi-threaded sums differ in their last bits between
+    # machines, which changes fits by micrometres. The matrices are too small to gain from threads.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     for stream in (sys.stdout, sys.stderr):  # escape characters that the terminal cannot encode
         if isinstance(stream, io.TextIOWrapper):

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 _MOVED_MM = 1e-6
 _FINE = 10  # number of samples per frame at which curves are checked against the bound
-_OFF_CURVE_MM, _MOST_HALVINGS = 0.003, 4  # tolerance of a polyline, and maximum number of its refinements
+_OFF_CURVE_MM, _MOST_HALVINGS = 0.003, 4  # tolerance of a polyline, and maximum number of refinements
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,8 +52,8 @@ class AuthoredMotion:
         first, last = self.frames[0], self.frames[-1]
         if not (last - first <= MOST_FRAMES and max(abs(first), abs(last)) <= FARTHEST_FRAME):
             raise FormatError(
-                f"the motion runs from frame {first:g} to {last:g}; at most {MOST_FRAMES} frames are allowed, within "
-                f"+-{FARTHEST_FRAME:g}."
+                f"the motion runs from frame {first:g} to {last:g}; at most {MOST_FRAMES} frames are allowed, "
+                f"with numbers from -{FARTHEST_FRAME:g} to {FARTHEST_FRAME:g}."
             )
 
 
@@ -105,7 +105,7 @@ def read_pose_table(path: Path) -> tuple[NDArray[np.int64], Array]:
 class Changes:
     """Summary of the changes made to a motion."""
 
-    figures: dict[str, float]  # numbers of frames, and distances [mm]
+    figures: dict[str, float]  # for JSON: numbers of frames, and distances [mm]
     lines: list[str]  # the changes as text; the first line is appended to the line with the file name
 
 

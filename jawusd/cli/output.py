@@ -60,7 +60,7 @@ def plain(value: object) -> object:
 
 @contextlib.contextmanager
 def progress() -> Iterator[Callable[[str, int, int], None]]:
-    """Show the progress of long work on stderr; yields the callback, called with (stage, done, total)."""
+    """Show the progress of long work on stderr; yield the callback for it, which takes (stage, done, total)."""
     from rich.console import Console
     from rich.progress import (
         BarColumn,

@@ -100,7 +100,9 @@ class _BakedRig:
 def _rigs_of(rig: Path, stage: Path | None, prims: list[str] | None) -> list[str | None]:
     """Return the prims to bake: those given, otherwise all rigs of the shot; None stands for the only rig or RIG."""
     if stage is not None and len(prims or ()) > 1:
-        raise typer.BadParameter("RIG STAGE bakes one rig; to bake several, name only the shot.", param_hint="--prim")
+        raise typer.BadParameter(
+            "RIG STAGE bakes one rig; to bake several rigs, give only the shot.", param_hint="--prim"
+        )
     if prims or stage is not None:
         return [*prims] if prims else [None]
     from jawusd.rig.layout import rig_prims

@@ -79,7 +79,7 @@ def report(
         _report_found(source, capture, out, force, allow_outside, as_json)
         return
     if out is None and not source.is_dir():
-        raise typer.BadParameter("name the folder of the figures with -o.", param_hint="--out")
+        raise typer.BadParameter("give the folder for the figures with -o.", param_hint="--out")
     from jawusd.pipeline import report as stage
     from jawusd.pipeline.fit import read_motion
     from jawusd.pipeline.subject import subject_of_build

@@ -63,7 +63,7 @@ def info(
         _print_schema(as_json)
         return
     if rig is None:
-        raise typer.BadParameter("name a file, or give --schema.", param_hint="RIG")
+        raise typer.BadParameter("give a rig file or tracks, or --schema.", param_hint="RIG")
     if rig.suffix == ".npz":
         from jawusd.cli.text_build import frame_lines, track_lines
         from jawusd.formats.tracks import load_tracks
@@ -78,7 +78,7 @@ def info(
             emit(one, as_json, lambda: frame_lines(one))
         return
     if frame is not None:
-        raise typer.BadParameter("--frame needs tracks.npz.")
+        raise typer.BadParameter("--frame applies only to tracks (.npz).")
     from jawusd.pipeline.state import recorded_verdict
     from jawusd.rig import describe
 

@@ -108,7 +108,7 @@ def skin_fit(
         jaw = jaw.with_bite(first, last)
     seen = read_face(face, fps, length_unit.value, rigid_bodies(rigid), rest_frame)
     if seen.fps is None:
-        raise typer.BadParameter("is needed: the face does not state a rate.", param_hint="--fps")
+        raise typer.BadParameter("is needed: the face capture does not state a frame rate.", param_hint="--fps")
     skin, offset_s = learn_skin(loaded, jaw, seen, offset, (head_error[0], math.radians(head_error[1])))
     jawusd.save_skin(out, skin)
     emit({"file": str(out), "offset_s": offset_s, **skin.meta}, as_json, lambda: _lines(out, skin, offset_s))

@@ -229,5 +229,5 @@ def live(
 def _named(entry: str) -> tuple[str, str]:
     name, found, where = entry.partition("=")
     if not found or not name or not where:
-        raise typer.BadParameter(f"{entry!r} is not NAME=WHERE, for example mid=/dev/video0.")
+        raise typer.BadParameter(f"{entry!r} is not of the form NAME=WHERE, such as mid=/dev/video0.")
     return name, where

@@ -104,7 +104,7 @@ def publish(
     if not source.is_dir():
         if out.suffix.lower() != ".usdz" or prefix is not None or prim_name is not None:
             raise typer.BadParameter(
-                "for a shot, name a .usdz, and give neither --prefix nor --prim-name.", param_hint="--out"
+                "a shot is packed as .usdz; give such a file, and neither --prefix nor --prim-name.", param_hint="--out"
             )
         files = [str(write_package(out, source))]
     else:
@@ -112,7 +112,7 @@ def publish(
     emit({"files": files}, as_json, lambda: files)
 
 
-_STILL_MM = 0.01  # displacement below which a jaw counts as still; ten times the rounding error of single precision
+_STILL_MM = 0.01  # displacement below which a jaw counts as still: ten times the rounding error of single precision
 
 
 def read_stage_motion(

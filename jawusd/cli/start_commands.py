@@ -35,7 +35,7 @@ def init(
         _print_reference(as_json)
         return
     if folder is None:
-        raise typer.BadParameter("name a folder, or give --reference.", param_hint="FOLDER")
+        raise typer.BadParameter("give a folder or --reference.", param_hint="FOLDER")
     from jawusd.cli.text_capture import start_lines
     from jawusd.pipeline.start_capture import start_capture, write_start
 

@@ -233,7 +233,7 @@ def contact_words(contact: object) -> str:
     return f"{meet} in occlusion; clearances are accurate to {error:.2f} mm"
 
 
-_FARTHEST_MM = 1.5  # largest distance that `meshes.collision` measures
+_FARTHEST_MM = 1.5  # maximum distance that `meshes.collision` measures
 
 
 def joint_words(joints: object) -> str:

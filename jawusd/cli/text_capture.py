@@ -121,7 +121,7 @@ def start_lines(start: CaptureStart) -> list[str]:
     return [*lines, f"next: jawusd check {folder}"]
 
 
-_LEAST_APART_MM = 10.0  # largest distance between cameras below which `capture.camera_checks` rejects a capture
+_LEAST_APART_MM = 10.0  # minimum extent of the camera positions; `capture.camera_checks` rejects captures below it
 
 
 def camera_lines(cameras: list[Camera], files: list[Path]) -> list[str]:

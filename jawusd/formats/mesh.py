@@ -36,7 +36,7 @@ class Mesh:
         if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3:
             raise ValueError(f"a mesh needs vertices (V, 3) and faces (F, 3), got {vertices.shape} and {faces.shape}")
         if len(faces) and (faces.min() < 0 or faces.max() >= len(vertices)):
-            raise ValueError(f"faces index vertex {faces.max()} of {len(vertices)}")
+            raise ValueError(f"faces refer to vertex {faces.max()}, but the mesh has {len(vertices)} vertices")
         if self.colors is not None and np.shape(self.colors) != vertices.shape:
             raise ValueError(f"colors must have shape {vertices.shape}, got {np.shape(self.colors)}")
         if self.labels is not None and np.shape(self.labels) != vertices.shape[:1]:

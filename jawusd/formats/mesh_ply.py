@@ -192,7 +192,7 @@ def _check_columns(path: Path, text: bytes, rows: int, used: int) -> None:
     lines = [line for line in text.splitlines() if line.strip()][:rows]
     held = sum(len(line.split()) for line in lines)
     if len(lines) == rows and held != used:
-        raise _bad_header(path, f"declares {used} numbers in {rows} lines, but they have {held}")
+        raise _bad_header(path, f"declares {used} numbers in {rows} lines, but the lines contain {held}")
 
 
 class _Reader:

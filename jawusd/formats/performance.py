@@ -152,7 +152,7 @@ def take_solved(arrays: NamedArrays, count: int, path: str | os.PathLike[str]) -
         return None
     found = {name: take(arrays, _PREFIX + name, shape, path) for name, shape in _shapes(count).items()}
     if not np.isin(found["state"], list(SolveState)).all():
-        raise FormatError(f'"{_PREFIX}state" has an unknown state.', path=path)
+        raise FormatError(f'"{_PREFIX}state" contains an unknown state.', path=path)
     return SolvedJaw(
         found["d"], found["sigma_mm"], found["margin_mm"], found["state"].astype(np.int8), found["valid"].astype(bool)
     )

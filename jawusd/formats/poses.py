@@ -199,8 +199,8 @@ def _checked_rigid(T: Array, table: TextTable) -> Array:
     defect = rigidity_defect(T) if len(T) else np.zeros(0)
     if defect.size and defect.max() > _RIGID_TOLERANCE:
         raise FormatError(
-            f"{table.places[int(defect.argmax())]}: the matrix is not rigid (off by {defect.max():.2g}, "
-            f"allowed {_RIGID_TOLERANCE:g}).",
+            f"{table.places[int(defect.argmax())]}: the matrix is not rigid (deviation "
+            f"{defect.max():.2g}; at most {_RIGID_TOLERANCE:g} is allowed).",
             path=table.path,
             hint="Matrices are row-major with the translation [mm] in the last column.",
         )

@@ -56,7 +56,7 @@ def save_scan_labels(path: str | os.PathLike[str], labels: ScanLabels, mesh: Mes
         OutputError: the file cannot be written.
     """
     if labels.labels.shape != mesh.vertices.shape[:1]:
-        raise ValueError(f"{labels.labels.shape} labels for {len(mesh.vertices)} vertices")
+        raise ValueError(f"labels must have shape ({len(mesh.vertices)},), got {labels.labels.shape}")
     meta = {
         "format": f"{FAMILY}/{VERSION}",
         "units": UNITS,

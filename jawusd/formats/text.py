@@ -40,7 +40,7 @@ def read_toml(path: str | os.PathLike[str]) -> dict[str, object]:
     path = Path(path)
     text = read_text(path, _MOST_TOML_BYTES)
     if _LONG_KEY.search(text):
-        raise FormatError(f"has a dotted key of more than {_MOST_DOTS} parts.", path=path)
+        raise FormatError(f"has a dotted key with more than {_MOST_DOTS} parts.", path=path)
     try:
         return tomllib.loads(text)
     except (ValueError, RecursionError) as error:  # raised also for numbers of more than 4300 digits

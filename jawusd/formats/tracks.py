@@ -224,7 +224,7 @@ def load_tracks(path: str | os.PathLike[str]) -> Tracks:
         if not name.startswith("lost_") or "lost_reason" in arrays  # older files lack all lost_* arrays
     }
     if not np.isin(values.get("lost_reason", 0), list(LostReason)).all():
-        raise FormatError('"lost_reason" has an unknown reason.', path=path)
+        raise FormatError('"lost_reason" contains an unknown reason.', path=path)
     for name in values:
         if "T_" in name:
             present = np.isfinite(values[name]).all((1, 2))
@@ -232,7 +232,8 @@ def load_tracks(path: str | os.PathLike[str]) -> Tracks:
             if defect.size and defect.max() > 1e-6:
                 frame = values["frames"][present][int(defect.argmax())]
                 raise FormatError(
-                    f'"{name}" of frame {frame} is not rigid (off by {defect.max():.2g}, allowed 1e-6).', path=path
+                    f'"{name}" of frame {frame} is not rigid (deviation {defect.max():.2g}; at most 1e-6 is allowed).',
+                    path=path,
                 )
     return Tracks(
         frames=values.pop("frames").astype(np.int64),
