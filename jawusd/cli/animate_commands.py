@@ -181,7 +181,8 @@ def arkit_fit(
     ],
     out: Annotated[Path, typer.Option("-o", "--out", help="Mapping to write (JSON).")] = Path("arkit.json"),
     fps: Annotated[
-        float | None, typer.Option(min=0.001, help="Frames per second of the face. Default: from its time codes.")
+        float | None,
+        typer.Option(min=0.001, help="Frames per second of the face capture. Default: from its time codes."),
     ] = None,
     jaw_fps: Annotated[
         float | None,
@@ -190,7 +191,7 @@ def arkit_fit(
     offset: Annotated[
         float | None,
         typer.Option(
-            help="Seconds from the jaw's frame 0 to the face's first row. Default: estimated from the opening."
+            help="Time from frame 0 of the jaw to the first row of the face [s]. Default: estimated from the opening."
         ),
     ] = None,
     force: Force = False,

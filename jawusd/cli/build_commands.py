@@ -235,7 +235,7 @@ def bake(
 def demo(
     out: Annotated[Path, typer.Option("-o", "--out", help="Folder of the capture.", show_default=False)],
     seed: Annotated[int, typer.Option(min=0, help="Seed of the random subject.")] = 0,
-    frames: Annotated[int, typer.Option(min=24, max=20000, help="Exercise frames.")] = 240,
+    frames: Annotated[int, typer.Option(min=24, max=20000, help="Number of exercise frames.")] = 240,
     force: Force = False,
 ) -> None:
     """Render a synthetic capture with ground truth: a random subject in front of three cameras.
@@ -275,7 +275,7 @@ def build_many(
         str | None,
         typer.Option(
             metavar="ADDRESS",
-            help="Dask scheduler, as tcp://host:8786; its workers need jawusd and the same paths. "
+            help="Dask scheduler, such as tcp://host:8786; its workers need jawusd and the same paths. "
             "Default: local processes.",
             show_default=False,
         ),
@@ -284,7 +284,7 @@ def build_many(
         int | None,
         typer.Option(min=1, max=1024, help="Number of local processes. Default: one per core.", show_default=False),
     ] = None,
-    retries: Annotated[int, typer.Option(min=0, max=100, help="Retries after a local process died.")] = 3,
+    retries: Annotated[int, typer.Option(min=0, max=100, help="Number of retries after a local process dies.")] = 3,
     resume: Annotated[bool, typer.Option("--resume", help="Continue earlier builds in this folder.")] = False,
     fresh: Annotated[bool, typer.Option("--fresh", help="Delete earlier builds in this folder first.")] = False,
     jobs: Annotated[int, typer.Option(min=1, max=64, help="Threads of each build.")] = 1,

@@ -189,7 +189,7 @@ def scans(
         typer.Option(
             "-o",
             "--out",
-            help="Folder of labels and image; name it in [scans] labels of the capture. Default: beside the "
+            help="Folder of labels and image; enter it in [scans] labels of the capture. Default: beside the "
             "scans, and the capture's folder.",
             show_default=False,
         ),

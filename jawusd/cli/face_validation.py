@@ -39,7 +39,7 @@ CsvOption = Annotated[Path | None, typer.Option(help="For --face: table of verdi
 StripOption = Annotated[
     Path | None,
     typer.Option(
-        help="For --face: picture to write (PNG): green inside, amber within the tolerance, red invalid.",
+        help="For --face: image to write (PNG): green is inside, amber within the tolerance, red invalid.",
         show_default=False,
     ),
 ]

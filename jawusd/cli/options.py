@@ -53,7 +53,8 @@ Allow = Annotated[
         "--allow",
         metavar="FOLDER",
         callback=_allow,
-        help="Folder from which a rig or shot may load files, such as a library; repeatable. Also: JAWUSD_ALLOW.",
+        help="Folder from which a rig or shot may load files, such as a library; repeatable. "
+        "Environment variable: JAWUSD_ALLOW.",
         show_default=False,
     ),
 ]
@@ -168,8 +169,8 @@ RigidOption = Annotated[
     typer.Option(
         metavar="BODY=MARKERS",
         help="For a file of markers: those fixed to the jaw and, unless the head is still, those fixed to the head. "
-        "Give numbers or names, as jaw=5,6,7,8 or jaw=JL,JR,JF (with --rest-frame), or a marker description, as "
-        "jaw=jaw.rig. Formats: C3D, TRC, QTM (TSV), Vicon CSV, plain tables of numbers, and ArtiSynth probes "
+        "Give numbers or names, such as jaw=5,6,7,8 or jaw=JL,JR,JF (with --rest-frame), or a marker description, "
+        "such as jaw=jaw.rig. Formats: C3D, TRC, QTM (TSV), Vicon CSV, plain tables of numbers, and ArtiSynth probes "
         "(marker%d.txt). Repeatable.",
         show_default=False,
     ),

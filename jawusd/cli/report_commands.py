@@ -142,7 +142,7 @@ def _report_found(
 PageOption = Annotated[
     Path | None,
     typer.Option(
-        help="Write a web page that poses the rig without a server, and end.", metavar="FILE.html", show_default=False
+        help="Write a web page that poses the rig without a server, and exit.", metavar="FILE.html", show_default=False
     ),
 ]
 
@@ -164,10 +164,10 @@ def view(
             show_default=False,
         ),
     ] = None,
-    host: Annotated[str, typer.Option(help="Address to listen on; the default accepts only this machine.")] = (
-        "127.0.0.1"
-    ),
-    port: Annotated[int, typer.Option(min=0, max=65535, help="Port; the next free one if it is taken.")] = 8080,
+    host: Annotated[
+        str, typer.Option(help="Address to listen on; the default accepts connections only from this machine.")
+    ] = ("127.0.0.1"),
+    port: Annotated[int, typer.Option(min=0, max=65535, help="Port; if it is in use, the next free port.")] = 8080,
     browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open a browser.")] = True,
     play: Annotated[
         bool, typer.Option("--play/--no-play", help="Begin by playing the captured take of a rig, if it has one.")

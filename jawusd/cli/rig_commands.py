@@ -193,12 +193,12 @@ def validate(
         Path | None, typer.Argument(help="CSV or JSON of poses or of d, tracks.npz, or an animated USD stage.")
     ] = None,
     residual_mm: Annotated[
-        float | None, typer.Option(help="Maximum distance from the model. Default: the rig's limit.")
+        float | None, typer.Option(help="Maximum distance from the model [mm]. Default: the rig's limit.")
     ] = None,
     tolerance_mm: Annotated[
         float | None,
         typer.Option(
-            min=0.0, help="Allowed distance outside the bound; 0 for authored poses. Default: set by the rig."
+            min=0.0, help="Allowed distance outside the bound [mm]; 0 for authored poses. Default: set by the rig."
         ),
     ] = None,
     face: FaceOption = None,
@@ -288,7 +288,7 @@ def _validate_rig(path: Path, changed: list[Changed], as_json: bool) -> None:
     findings = [Finding(one.severity, one.kind, one.path or "", one.message) for one in changed]
     findings += validate_stage(path)
     if not rig_prims(open_stage(path)):
-        words = "has no active rig (no prim with JawRigAPI): the rules for rigs were not applied."
+        words = "has no active rig (no prim with JawRigAPI); the rules for rigs were not applied."
         findings.append(Finding("info", "Rig", "/", words))
     nvidia = find_nvidia_validator()
     if nvidia is not None:

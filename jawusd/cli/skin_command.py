@@ -32,18 +32,21 @@ FaceArg = Annotated[
     ),
 ]
 Out = Annotated[Path, typer.Option("-o", "--out", help="Learned map to write (.npz).")]
-Fps = Annotated[float | None, typer.Option(min=0.001, help="Frames per second of the face. Default: that of the file.")]
+Fps = Annotated[
+    float | None, typer.Option(min=0.001, help="Frames per second of the face capture. Default: that of the file.")
+]
 JawFps = Annotated[
     float | None, typer.Option(min=0.001, help="Frames per second of the jaw. Default: that of the tracks or the rig.")
 ]
 Offset = Annotated[
-    float | None, typer.Option(help="Seconds from the jaw's frame 0 to the face's. Default: estimated from the motion.")
+    float | None,
+    typer.Option(help="Time from frame 0 of the jaw to frame 0 of the face [s]. Default: estimated from the motion."),
 ]
 Bites = Annotated[
     list[str] | None,
     typer.Option(
         metavar="FIRST-LAST",
-        help="Frames of the jaw with closed lips and the teeth in occlusion, as 1200-1260. Repeatable.",
+        help="Frames of the jaw with closed lips and the teeth in occlusion, such as 1200-1260. Repeatable.",
         show_default=False,
     ),
 ]
@@ -51,7 +54,7 @@ Rigid = Annotated[
     list[str] | None,
     typer.Option(
         metavar="head=MARKERS",
-        help="Markers fixed to the head, to which points are made relative: names, numbers, or a "
+        help="Markers fixed to the head; points are expressed relative to them: names, numbers, or a "
         "marker description. Names and numbers need --rest-frame. Default: the points are stabilised.",
         show_default=False,
     ),
@@ -64,7 +67,7 @@ HeadError = Annotated[
     typer.Option(
         min=0.0,
         metavar="MM DEGREES",
-        help="Additional standard deviation of the error of head stabilisation in later takes, compared with this one.",
+        help="Additional standard deviation of the head-stabilisation error in later takes, relative to this take.",
     ),
 ]
 

@@ -37,7 +37,7 @@ ShotArg = Annotated[Path, typer.Argument(help="capture.toml of the shot, or its 
 OverlayFile = Annotated[
     Path | None,
     typer.Option(
-        help="Video (.mp4) to write of the solved teeth over all cameras side by side.",
+        help="Video (.mp4) to write: the solved teeth over the images of all cameras.",
         show_default=False,
     ),
 ]
@@ -51,7 +51,7 @@ ReportFile = Annotated[
 SkinFile = Annotated[
     Path | None,
     typer.Option(
-        help="Map from facial skin to d, from skin-fit, for frames with hidden teeth. Needs --face.",
+        help="Map from facial skin to d, written by skin-fit, for frames with hidden teeth. Needs --face.",
         show_default=False,
     ),
 ]
@@ -62,11 +62,13 @@ FaceFile = Annotated[
     ),
 ]
 FaceFps = Annotated[
-    float | None, typer.Option(min=0.001, help="Frames per second of the face. Default: that of the file.")
+    float | None, typer.Option(min=0.001, help="Frames per second of the face capture. Default: that of the file.")
 ]
 FaceOffset = Annotated[
     float | None,
-    typer.Option(help="Seconds from the shot's frame 0 to the face's. Default: estimated from visible teeth."),
+    typer.Option(
+        help="Time from frame 0 of the shot to frame 0 of the face [s]. Default: estimated from visible teeth."
+    ),
 ]
 SkinOnly = Annotated[bool, typer.Option("--skin-only", help="Ignore the images: no frame of the shot shows the teeth.")]
 
@@ -176,7 +178,9 @@ def live(
     ] = None,
     osc: Annotated[str | None, typer.Option(metavar="HOST:PORT", help="OSC messages: /jaw/d, /jaw/sigma, ...")] = None,
     view: Annotated[bool, typer.Option("--view", help="Also show the jaw in a page on this machine.")] = False,
-    port: Annotated[int, typer.Option(min=0, max=65535, help="Port of the page; the next free one if taken.")] = 8080,
+    port: Annotated[
+        int, typer.Option(min=0, max=65535, help="Port of the page; if it is in use, the next free port.")
+    ] = 8080,
     head: Annotated[Head, typer.Option(help="fixed: the cameras are head-mounted.")] = Head.free,
     seconds: Annotated[
         float | None, typer.Option(min=0.1, help="Stop after this time [s].", show_default=False)

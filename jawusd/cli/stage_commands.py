@@ -84,7 +84,7 @@ def encode(
 def publish(
     source: Annotated[
         Path,
-        typer.Argument(help="Folder of a rig, with actor.usda, or a shot.", metavar="FOLDER|SHOT", show_default=False),
+        typer.Argument(help="Folder of a rig (with actor.usda), or a shot.", metavar="FOLDER|SHOT", show_default=False),
     ],
     out: Annotated[
         Path, typer.Option("-o", "--out", help="Folder to write, or the .usdz of a shot.", show_default=False)
@@ -170,7 +170,7 @@ def _fitted(
 
     _refuse_model(rig)
     if rig.resolve() == stage.resolve():
-        message = f"the meshes of {stage} deform and must be fitted to those of the rig: name the rig first."
+        message = f"the meshes of {stage} deform and must be fitted to those of the rig: give the rig before the stage."
         raise typer.BadParameter(message, param_hint="RIG")
     found = fit_poses_of_stage(stage, rig, mandible, skull, prim)
     d, residual_mm = loaded.encode(found.T)

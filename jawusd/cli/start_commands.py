@@ -23,7 +23,7 @@ def init(
     fps: Annotated[
         float | None, typer.Option(min=0.001, max=10000.0, help="Frames per second.", show_default=False)
     ] = None,
-    reference: Annotated[bool, typer.Option("--reference", help="List every key of capture.toml and stop.")] = False,
+    reference: Annotated[bool, typer.Option("--reference", help="List every key of capture.toml and exit.")] = False,
     force: Force = False,
     as_json: Json = False,
 ) -> None:
@@ -86,7 +86,7 @@ def cameras(
     unit_mm: Annotated[float, typer.Option(min=1e-6, help="Length of the source's unit [mm]: 1000 for metres.")] = 1.0,
     size: Annotated[
         str | None,
-        typer.Option(help="Image size, as 1920x1080, if the source does not state it.", show_default=False),
+        typer.Option(help="Image size, such as 1920x1080, if the source does not state it.", show_default=False),
     ] = None,
     force: Force = False,
     as_json: Json = False,

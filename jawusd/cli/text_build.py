@@ -186,7 +186,11 @@ def _take_lines(summary: TrackSummary) -> list[str]:
     if "registration" in summary:
         bite = summary["registration"]
         shift, turn, *sigmas = registration_sizes(bite)
-        what = "lower scan moved to the closed bite by" if bite["applied"] else "lower scan off the closed bite by"
+        what = (
+            "lower scan moved to the closed bite by"
+            if bite["applied"]
+            else "lower scan deviates from the closed bite by"
+        )
         lines.append(f"  {what} {shift:.2f} +- {sigmas[0]:.2f} mm, {turn:.2f} +- {sigmas[1]:.2f} degrees")
     return lines
 

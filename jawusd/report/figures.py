@@ -93,7 +93,7 @@ def model_figure(model: JawModel) -> Figure:
             *thinned(model.frames, model.d[:, index], larger_magnitude), style, color=color, lw=1.2, label=name
         )
     axes[0].set_ylabel("parameter [mm]")
-    axes[1].plot(*thinned(model.frames, model.residual_mm, np.fmax), color=BLUE, lw=1, label="pose to model")
+    axes[1].plot(*thinned(model.frames, model.residual_mm, np.fmax), color=BLUE, lw=1, label="distance from the model")
     axes[1].axhline(rig.limits.residual_mm, color=VERMILION, lw=1, ls="--", label="limit of a valid pose")
     axes[1].set_ylabel("landmarks,\nrms [mm]")
     axes[1].set_ylim(bottom=0)

@@ -34,7 +34,7 @@ def save_strip(path: Path, frames: Array, verdicts: Verdicts) -> None:
     handles = [Patch(color=ink, label=label) for ink, label in zip(_INKS, counts, strict=True)]
     strip.legend(handles=handles, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=3, frameon=False)
     lines.plot(frames, verdicts.margin_mm, color="black", label="margin to the bound")
-    lines.plot(frames, verdicts.residual_mm, color="grey", linestyle="--", label="distance to the model")
+    lines.plot(frames, verdicts.residual_mm, color="grey", linestyle="--", label="distance from the model")
     lines.axhline(-verdicts.tolerance_mm, color="grey", linewidth=0.5)
     lines.set_xlabel("frame")
     lines.set_ylabel("mm")

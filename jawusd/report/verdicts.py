@@ -314,7 +314,7 @@ def _rig(data: ReportData) -> Verdict:
             "Correct what `jawusd validate` reports.",
         ),
         _below(
-            "pose table against the exact model, worst vertex",
+            "pose table compared with the exact model, worst vertex",
             data.rig.table_error_mm,
             *_TABLE_MM,
             "mm",

@@ -49,7 +49,7 @@ def link_rigs(stage: Usd.Stage, prim_map: PrimMap) -> bool:
             _note_missing_sliders(prim, _nearest_object(prim_map, prim.GetPath()))
             continue
         if any(modifier.type == "ARMATURE" for mesh in meshes_of(mandible) for modifier in mesh.modifiers):
-            actor[_FIXED] = f"{prim.GetPath()}: bones move it. For sliders import it with motion = transforms."
+            actor[_FIXED] = f"{prim.GetPath()}: bones move it. To get sliders, import it with motion = transforms."
             continue
         actor[SOURCE] = _source_of(prim)
         actor[FPS] = stage.GetTimeCodesPerSecond()
@@ -69,9 +69,9 @@ def _mandible_path(prim: Usd.Prim) -> Sdf.Path:
 def _note_missing_sliders(prim: Usd.Prim, nearest: bpy.types.Object | None) -> None:
     """Store in an object why a rig below it has no sliders."""
     if prim.IsInstance() or prim.IsInstanceProxy():
-        why = 'it is instanced. For sliders import it with "Scene Instancing" off.'
+        why = 'it is instanced. To get sliders, import it with "Scene Instancing" off.'
     else:
-        why = "its mandible was not imported. For sliders import the whole rig."
+        why = "its mandible was not imported. To get sliders, import the whole rig."
     print(f"jawusd: {prim.GetPath()}: {why}")
     if nearest is not None:
         nearest[_FIXED] = "\n".join(filter(None, (nearest.get(_FIXED), f"{prim.GetPath()}: {why}")))
