@@ -67,7 +67,7 @@ def rebake(
     force: Force = False,
     as_json: Json = False,
 ) -> None:
-    """Make d and the mandible's transform agree, for all rigs of a shot, after only one of them was edited.
+    """Make d and the mandible's transform agree, for all rigs of a shot, where only one of the two was edited.
 
     The layer written contains opinions for all rigs; add it to the sublayers of the shot. Motions are projected into
     the bound, and samples outside it are reported with their margin. If a stage has no rig but copies of its meshes,

@@ -119,7 +119,7 @@ def scan_library(folder: str | os.PathLike[str], load: Loader) -> Library:
 
 
 def load_donors(library: Library, load: Loader) -> list[Donor]:
-    """Read the rigs of all subjects whose captures include every movement; name them by their paths.
+    """Read the rigs of all subjects whose captures include every movement, named by their paths.
 
     Raises:
         JawusdError: a rig has become unreadable since the scan.

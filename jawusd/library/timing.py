@@ -53,7 +53,7 @@ def _zigzag(rising: Mask, wanted: Array) -> Array:
 class _Slopes:
     """Derivative of a convex, piecewise quadratic cost, stored as line segments between knots.
 
-    A line is (slope, offset). A knot is its position and the changes of slope and offset there; knots run from left to
+    A line is (slope, offset). A knot has a position and the changes of slope and offset there; knots run from left to
     right.
     """
 

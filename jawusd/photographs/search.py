@@ -85,7 +85,7 @@ def typical_bites(scans: Sequence[Scan]) -> list[TypicalBite]:
 
 
 def _sides(scan: Scan, arch: int) -> list[float]:
-    """Return the signs with which an arch's smallest principal axis may point up."""
+    """Return the signs for which the smallest principal axis of an arch may point up."""
     if len(scan.gum_faces) < len(scan.crown_faces) // 10:
         return [1.0, -1.0]
     gum = scan.vertices[np.unique(scan.gum_faces)].mean(0) - scan.centre

@@ -105,8 +105,8 @@ def row_matrix(T: Rows, scale: float = 1.0) -> list[float]:
 def unreal_pose(T: Rows, scale: float = 0.1) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """Return location and quaternion (x, y, z, w) of a pose in Unreal's left-handed axes with Z up.
 
-    Unreal's USD importer swaps y and z, which is a reflection S. A rotation R becomes S R S; its axis is that of R with
-    y and z swapped, negated.
+    Unreal's USD importer swaps y and z, which is a reflection S. A rotation R becomes S R S, whose axis is that of R
+    with y and z swapped and all signs changed.
     """
     (x, y, z), (qw, qx, qy, qz) = jawusd_reader.decompose(T)
     return (scale * x, scale * z, scale * y), (-qx, -qz, -qy, qw)

@@ -100,7 +100,7 @@ def _error_tables(data: ReportData) -> list[tuple[str, str, list[tuple[str, dict
 
 
 def _frame_lists(data: ReportData) -> list[tuple[str, int, str]]:
-    """Return (reason, count, frames as text) of frames that were lost, regularised, or excluded from the fit."""
+    """Return (reason, count, frames as text) for frames that were lost, regularised, or excluded from the fit."""
     tracks, meta = data.tracks, data.model.notes
     lists = {"lost by the tracker": tracks.frames[np.any(tracks.status == LOST, axis=1)]}
     for arch, name in enumerate(("upper", "lower")):

@@ -22,7 +22,7 @@ _SCRIPTS = ("scene.js", "decoder.js", "drag.js", "keys.js", "timeline.js", "pose
 
 @dataclass(frozen=True, eq=False)
 class PosePage:
-    """Contents of the page."""
+    """Contents of the page that poses a rig."""
 
     name: str  # name of the actor
     rig: JawRig

@@ -43,7 +43,7 @@ class ScanSurface:
 
 @dataclass(frozen=True, eq=False)
 class Expectation:
-    """Expected crowns in an image; lengths in px are pixels of this image."""
+    """Expected crowns in an image; lengths [px] are in pixels of this image."""
 
     labels: NDArray[np.uint8]  # labels of the visible crowns: OTHER, UPPER or LOWER, shape (h, w)
     # signed distance to the outline of each arch's visible crowns, positive inside, shape (2, h, w)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from jawusd.base.arrays import Mask
 from jawusd.segmentation.colours import SegmentationConfig, log_chroma
 
-_EVEN = 1e-4  # variance added to that of the log colours [-], which accounts for errors of half an 8-bit step
+_EVEN = 1e-4  # variance added to the variance of the log colours [-], for errors of half an 8-bit step
 _FEWEST = 100  # minimum number of pixels near the border for estimating the covariance of colours
 _ARCH_BLUR_PX = 0.8  # sigma of the blur that makes the coverage fractional at the border between the arches
 _FAR_BLUR_PX = 2.0  # sigma of the blur that assigns tooth pixels far from both arches to the nearer arch

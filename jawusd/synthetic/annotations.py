@@ -80,7 +80,7 @@ def drawn_mask(coverage: NDArray[np.uint8], rng: np.random.Generator) -> NDArray
 
 
 def _ellipse(mask: Mask, row: float, column: float, radius: Array, value: bool) -> None:
-    """Set the pixels of a small ellipse."""
+    """Set the pixels of a small ellipse to a value."""
     y, x = np.ogrid[: mask.shape[0], : mask.shape[1]]
     mask[((y - row) / radius[0]) ** 2 + ((x - column) / radius[1]) ** 2 <= 1.0] = value
 

@@ -139,7 +139,7 @@ def _swing(n: int) -> Array:
 
 
 def _border(n: int, turn: float, end: int) -> tuple[Array, Array]:
-    """Trace the border: move to one side with teeth closed, open along it, cross over, close along the other side.
+    """Trace the border: the jaw moves to one side with closed teeth, opens there, crosses over, closes on the other.
 
     The mandible crosses over during the first part of closing (fraction `turn`), and returns to the middle in the last
     `end` frames.

@@ -1,11 +1,11 @@
 """Temporomandibular joint: two condyles on curved eminences, driven by opening, lateral and protrusion controls.
 
 Poses are in the scan frame (x to the subject's left, y up, z anterior, mm); at the identity, the teeth are in
-occlusion. The mandible has four
-joint coordinates: the pitch about the condylar axis, the forward slide of each condyle, and the side shift. The heights
-of the condyles follow from the eminences, and their lateral positions from the constant distance between them, so both
-condyles stay on their slopes in every pose. Joint surfaces, guidance and ranges follow textbook TMJ mechanics
-(Posselt 1952, Okeson 2019) and are independent of the models that jawusd fits.
+occlusion. The mandible has four joint coordinates: the pitch about the condylar axis, the forward slide of each
+condyle, and the side shift. The heights of the condyles follow from the eminences, and their lateral positions from
+the constant distance between them, so that both condyles stay on their slopes in every pose.
+Joint surfaces, guidance and ranges follow textbook TMJ mechanics (Posselt 1952, Okeson 2019) and are independent of the
+models that jawusd fits.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ def smoothstep(x: ArrayLike) -> Array:
 
 
 def eminence(joint: Joint, side: int, slide_mm: ArrayLike, medial_mm: ArrayLike = 0.0) -> Array:
-    """Return the height of a condyle centre relative to rest [mm], negative down the eminence.
+    """Return the height of a condyle centre relative to rest [mm], negative if it is down the eminence.
 
     The sagittal section is `eminence_path`.
 
@@ -137,7 +137,7 @@ def controlled_pose(
 
 
 def _coupling(joint: Joint, opening: Array) -> Array:
-    """Return the fraction of the full slide of the condyles at an opening; it starts early but lags behind rotation."""
+    """Return the fraction of the full condylar slide at an opening; the slide starts early but lags behind rotation."""
     onset = joint.slide_onset
     early = opening**2 * (1.0 + onset) / (opening + onset)
     return joint.slide_early * early + (1.0 - joint.slide_early) * smoothstep(opening)
@@ -196,5 +196,5 @@ def _glide(guidance: Array, distance_mm: Array) -> Array:
 
 
 def _soft_positive(x: Array) -> Array:
-    """Return the positive part of a value with a rounded corner; it is zero at zero."""
+    """Return the positive part of a value, with a rounded corner; the result is 0 at 0."""
     return (x + np.hypot(x, _CUSP_ROUNDING_MM) - _CUSP_ROUNDING_MM) / 2

@@ -128,7 +128,7 @@ def _front_rings(form: CrownForm, angle: Array, rng: np.random.Generator) -> Arr
 
 
 def _edge_drop(form: CrownForm, X: Array, rng: np.random.Generator) -> Array:
-    """Return the depth of the edge below its highest point [mm]: rounded corners, canine shoulders, wear tilt."""
+    """Return the depth of the edge below its highest point [mm]: rounded corners, canine shoulders, tilt from wear."""
     relative = X / (0.5 * form.width_mm)
     tilt = 0.15 * rng.uniform(-1.0, 1.0) * relative
     if form.tip_mm:

@@ -43,7 +43,7 @@ class FootagePanel:
         turned: Callable[[], None],
         changed: Callable[[], None],
     ) -> None:
-        """Add the widgets to the current container; call `turned` if the view changes, `changed` on other changes."""
+        """Add the widgets to the current container; call `turned` if the view changes, else `changed`."""
         self._client, self._capture, self._turned, self._changed = client, capture, turned, changed
         self._loading = False
         self.view = next(iter(capture.sizes_px))
@@ -202,7 +202,7 @@ class PicksPanel:
         turned: Callable[[], None],
         changed: Callable[[], None],
     ) -> None:
-        """Add the widgets to the current container; call `turned` if the side changes, `changed` on other changes."""
+        """Add the widgets to the current container; call `turned` if the side changes, else `changed`."""
         self._client, self._capture, self._footage = client, capture, footage
         self._turned, self._changed = turned, changed
         self.book, self.side = PickBook(capture.picks), "front"

@@ -194,7 +194,7 @@ class PickingLayout:
 
 
 def fit_view(points: ArrayLike, away: ArrayLike, up: ArrayLike, aspect: float) -> tuple[Array, Array]:
-    """Return the closest camera position (3,) from which all points (n, 3) are visible, and its target (3,).
+    """Return the nearest camera position (3,) from which all points (n, 3) are visible, and its target (3,).
 
     Args:
         away: direction from target to camera, shape (3,).

@@ -108,7 +108,7 @@ class ScanLabelsPanel:
         turned: Callable[[], None],
         painted: Callable[[str], None],
     ) -> None:
-        """Add the widgets; call `turned` when painting is switched on or off, `painted` with an arch to redraw it."""
+        """Add the widgets; call `turned` when painting is switched on or off, and `painted` to redraw an arch."""
         self._client, self._capture, self._turned, self._painted = client, capture, turned, painted
         self.brush = ScanBrush(capture.scans, capture.labels)
         self.label = BRUSHES["crown"]

@@ -35,9 +35,9 @@ _STRIP_PX = 6
 
 
 def frames_to_inspect(tracks: Tracks, fps: float) -> list[int]:
-    """Return frames to inspect, worst first and at least half a second apart: lost frames, then by coverage.
+    """Return frames to inspect, worst first and at least half a second apart.
 
-    Frames of a solve are ordered by `severity`.
+    Lost frames come first, then frames by uncovered mask area; frames of a solve are ordered by `severity`.
     """
     if tracks.solved is not None:
         badness = severity(tracks.solved)

@@ -36,7 +36,7 @@ _poses: dict[tuple[str, float, float, float, bool], tuple[float, ...]] = {}
 
 
 def link_rigs(stage: Usd.Stage, prim_map: PrimMap) -> bool:
-    """Add sliders, drivers and keys to the rigs of an imported stage; return whether it has rigs.
+    """Add sliders, drivers and keys to the rigs of an imported stage; return whether the stage has rigs.
 
     Rigs that cannot have sliders are left as imported; the panel displays the reason.
     """
