@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
+from functools import partial
 from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
 from jawusd.base.arrays import Array
-from jawusd.base.errors import TrackingError
 from jawusd.geometry import Camera, relative_pose, transform_points
 from jawusd.pipeline.picture_search import Start
 from jawusd.pipeline.state import Progress
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from jawusd.tracking.contour.scan import Scan
     from jawusd.tracking.contour.views import View
     from jawusd.tracking.region.appearance import Cut, Picture
+    from jawusd.tracking.region.recovery import Begin
     from jawusd.tracking.region.tracker import RegionPose, RegionTracker
 
 
@@ -74,11 +75,7 @@ class Cutter:
         return None if window is None else Picture(window.camera, window.rgb)
 
 
-# Threshold of the second difference of the jaw's position [mm], above which the preceding frames are tracked again
-# backwards; and distance [mm] below which two poses count as equal. Speech and chewing reach second differences of 1 mm
-# at 24 fps; a false positive costs the time of one frame.
-_JUMP_MM, _SAME_MM = 0.8, 0.15
-_SAMPLED_VIEWS = 10  # maximum number of frames whose views are kept, a few MB in all
+_SAMPLED_VIEWS = 10  # maximum number of frames whose views are kept: a few MB
 STAGE = "follow"
 
 #: Function that searches for the teeth in a range of frames, passes the pose found to `Follower.start_at`, and returns
@@ -115,6 +112,7 @@ class Follower:
         self._footage, self._scans, self._subject = footage, scans, subject
         self._pool = pool
         self.sampled_views: list[tuple[Array, list[View]]] = []
+        self._wanted: set[int] = set()  # frames to be sampled
 
     def start_at(self, frame: int, poses: Array) -> tuple[RegionPose, float]:
         """Refine T_world_upper, T_world_lower (2, 4, 4) in the frame from which `run` will start; return pose and fit.
@@ -125,6 +123,7 @@ class Follower:
             CaptureError: an image cannot be decoded.
         """
         from jawusd.tracking.contour.scan import teeth_centre
+        from jawusd.tracking.region.recovery import Begin
         from jawusd.tracking.region.tracker import RegionTracker
 
         cutter = Cutter(self.cameras, self._scans, teeth_centre(self._scans, poses), self._pool)
@@ -132,7 +131,7 @@ class Follower:
         landmarks, cameras = self._subject.landmarks, list(self.cameras.values())
         tracker = RegionTracker(self._scans, cameras, landmarks, axes, executor=self._pool)
         found = tracker.begin(cutter.cut(self._footage.at(frame)), poses)
-        self._start: tuple[int, RegionPose, RegionTracker, Cutter] = frame, found, tracker, cutter
+        self._begin = Begin(frame, found, partial(self._walk, tracker, cutter))
         return found, tracker.first_fit
 
     def run(self, frames: range, find: Find, progress: Progress) -> dict[int, RegionPose]:
@@ -143,44 +142,32 @@ class Follower:
         Raises:
             CaptureError: an image cannot be decoded.
         """
-        from jawusd.tracking.region.recovery import both_ways, recover
+        from jawusd.tracking.region.recovery import TwoWays
 
-        frame, begin, tracker, cutter = self._start
+        points, up = self._subject.landmarks[:3], self._subject.T_anatomical_skull[1, :3]
+
+        def search(lost: range, near: RegionPose) -> Begin[RegionPose]:
+            find(lost, near.poses[0, :3, :3] @ up)
+            return self._begin
+
+        def places(found: RegionPose) -> Array:
+            return transform_points(relative_pose(*found.poses), points)
+
+        take = TwoWays(frames, places, lambda found: found.objective_px, progress=partial(progress, STAGE))
         self.sampled_views.clear()
-        sampled = set(np.linspace(frames.start, frames.stop - 1, _SAMPLED_VIEWS).astype(int).tolist())
-        out, points = {frame: begin}, self._subject.landmarks[:3]
-        progress(STAGE, 1, len(frames))
-        for way in both_ways(frame, frames):
-            cuts = _Latest(cutter.walk(self._footage, way))
-            for at, found in zip(way, tracker.follow(cuts, begin.poses), strict=True):
-                out[at] = found
-                if at in sampled and found.found.all():
-                    self.sampled_views.append((found.poses, tracker.views(cuts.latest(found.poses), found.poses)))
-                progress(STAGE, len(out), len(frames))
-            for jump in _jumps(way, out, points):
-                back = range(jump - way.step, frame, -way.step)
-                _replace(back, tracker.follow(cutter.walk(self._footage, back), out[jump].poses), out, points)
-        recover(out, frames, lambda lost: self._followed_from(lost, frames, find, out))
-        return out
+        self._wanted = set(np.linspace(frames.start, frames.stop - 1, _SAMPLED_VIEWS).astype(int).tolist())
+        take.follow(self._begin)
+        take.recover(search)
+        return take.known
 
-    def _followed_from(
-        self, lost: range, frames: range, find: Find, known: Mapping[int, RegionPose]
-    ) -> dict[int, RegionPose] | None:
-        """Return all poses after a search in lost frames; None if the search fails or contradicts the known poses."""
-        from jawusd.tracking.region.recovery import both_ways, contradicts, nearest_found
-
-        up_world = nearest_found(known, lost).poses[0, :3, :3] @ self._subject.T_anatomical_skull[1, :3]
-        try:
-            begin = find(lost, up_world)
-        except TrackingError:
-            return None
-        frame, pose, tracker, cutter = self._start
-        again, points = {**known, begin.frame: pose}, self._subject.landmarks[:3]
-        meetings = [
-            _replace(way, tracker.follow(cutter.walk(self._footage, way), pose.poses), again, points)
-            for way in both_ways(frame, frames)
-        ]
-        return None if contradicts(meetings) else again
+    def _walk(self, tracker: RegionTracker, cutter: Cutter, way: range, near: RegionPose) -> Iterator[RegionPose]:
+        """Yield the poses of frames in tracking order, next to a given pose; sample the views of some."""
+        cuts = _Latest(cutter.walk(self._footage, way))
+        for frame, found in zip(way, tracker.follow(cuts, near.poses), strict=True):
+            if frame in self._wanted and found.found.all():
+                self._wanted.remove(frame)
+                self.sampled_views.append((found.poses, tracker.views(cuts.latest(found.poses), found.poses)))
+            yield found
 
 
 class _Latest(Iterator["Cut"]):
@@ -192,27 +179,3 @@ class _Latest(Iterator["Cut"]):
     def __next__(self) -> Cut:
         self.latest = next(self._cuts)
         return self.latest
-
-
-def _places(found: RegionPose, points: Array) -> Array:
-    """Return points (N, 3) of the lower teeth in the coordinate frame of the upper teeth [mm], shape (N, 3)."""
-    return transform_points(relative_pose(found.poses[0], found.poses[1]), points)
-
-
-def _jumps(way: range, known: Mapping[int, RegionPose], points: Array) -> list[int]:
-    """Return the video frames at which the jaw accelerates implausibly."""
-    if len(way) < 3:
-        return []
-    places = np.stack([_places(known[frame], points) for frame in way])
-    bend_mm = np.linalg.norm(np.diff(places, 2, axis=0), axis=-1).mean(-1)
-    return [way[k + 2] for k in np.flatnonzero(bend_mm > _JUMP_MM).tolist()]
-
-
-def _replace(way: range, again: Iterator[RegionPose], known: dict[int, RegionPose], points: Array) -> bool | None:
-    """Replace poses as `replace_poses` does; two poses are compared at `points` (N, 3) of the lower teeth [mm]."""
-    from jawusd.tracking.region.recovery import replace_poses
-
-    def same(other: RegionPose, before: RegionPose) -> bool:
-        return bool(np.linalg.norm(_places(other, points) - _places(before, points), axis=-1).mean() < _SAME_MM)
-
-    return replace_poses(way, again, known, same, lambda other, before: other.objective_px > before.objective_px)

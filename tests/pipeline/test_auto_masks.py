@@ -1,7 +1,5 @@
 """Automatic masks are recognised, and the tracker allows them larger errors than drawn ones."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from package_copy import ROOT
@@ -10,12 +8,10 @@ from jawusd.base.errors import FormatError
 from jawusd.formats.capture import load_capture
 from jawusd.formats.tracks import LOST, RECOVERED, TRACKED, Tracks
 from jawusd.geometry import make_transform
-from jawusd.pipeline.follow import _jumps, _replace
 from jawusd.pipeline.segment_guide import GUIDE, combine_guide, save_guide
 from jawusd.pipeline.segment_record import SUMMARY, auto_masks_folder, with_masks
 from jawusd.pipeline.track import tracking_config
 from jawusd.tracking.config import FOR_TAKES
-from jawusd.tracking.region.recovery import lost_stretches
 from jawusd.tracking.region.tracker import RegionPose
 
 LANDMARKS = np.array([[0, 0, 0], [20, 0, -25], [-20, 0, -25], [50, 40, -80], [-50, 40, -80]], float)
@@ -126,46 +122,3 @@ def test_masks_without_their_guide_are_told(tmp_path):
     (tmp_path / GUIDE).write_bytes(b"damaged")
     with pytest.raises(FormatError, match=GUIDE):
         combine_guide(capture, tracks, LANDMARKS)
-
-
-def _followed(frames, mm, objective_px=900.0):
-    """Return followed poses, with the jaw moved by these amounts along x [mm] in each frame."""
-    covariance = np.tile(np.eye(6), (2, 1, 1))
-    return {
-        int(frame): RegionPose(
-            np.stack([np.eye(4), make_transform(np.eye(3), [x, 0.0, 0.0])]), np.ones(2, bool), covariance, objective_px
-        )
-        for frame, x in zip(frames, mm, strict=True)
-    }
-
-
-def test_a_jaw_found_again_is_followed_back_to_where_it_was_lost():
-    frames = range(20, 60)
-    moved = 0.5 * np.arange(40)
-    wrong = moved.copy()
-    wrong[15:25] += 1.5  # mm: lost on frame 35, found again on frame 45
-    known = _followed(frames, wrong, 700.0) | {f: v for f, v in _followed(frames, wrong).items() if not 35 <= f < 45}
-    assert _jumps(frames, known, LANDMARKS[:3]) == [35, 36, 45, 46]
-    back = range(44, 20, -1)
-    right = _followed(frames, moved)
-    assert _replace(back, (right[f] for f in back), known, LANDMARKS[:3]) is True
-    assert [known[f].poses[1, 0, 3] for f in frames] == pytest.approx(moved)
-
-
-def test_poses_followed_back_that_fit_less_change_nothing():
-    frames = range(20, 30)
-    known, worse = _followed(frames, np.zeros(10)), _followed(frames, np.ones(10), 500.0)
-    before = dict(known)
-    assert _replace(range(28, 20, -1), (worse[f] for f in range(28, 20, -1)), known, LANDMARKS[:3]) is False
-    assert known == before and _jumps(frames, known, LANDMARKS[:3]) == []
-
-
-def test_poses_lost_again_end_a_replacement():
-    frames = range(20, 30)
-    known, again = _followed(frames, np.zeros(10)), _followed(frames, np.ones(10))
-    lost = replace(again[25], found=np.array([True, False]))
-    known |= {frame: replace(known[frame], found=np.zeros(2, bool)) for frame in range(22, 26)}
-    assert lost_stretches(known, frames) == [range(22, 26)]
-    assert _replace(range(22, 30), (again[f] if f < 25 else lost for f in range(22, 30)), known, LANDMARKS[:3]) is None
-    assert [known[f].poses[1, 0, 3] for f in frames] == pytest.approx([0, 0, 1, 1, 1, 0, 0, 0, 0, 0])
-    assert lost_stretches(known, frames) == []  # one frame is left

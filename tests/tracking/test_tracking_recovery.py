@@ -1,45 +1,67 @@
-"""Lost frames are searched once, and what is found replaces known poses only where it may."""
+"""A take is followed both ways, later poses judge earlier ones, and lost frames are searched once."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import pytest
 
-from jawusd.tracking.region.recovery import contradicts, lost_stretches, nearest_found, recover, replace_poses
+from jawusd.base.errors import TrackingError
+from jawusd.tracking.region.recovery import Begin, TwoWays, lost_stretches, nearest_found
 
 FRAMES = range(10, 30)
 
 
 @dataclass
 class Pose:
-    """A pose that is a number."""
+    """A pose that is a number, the position of the lower teeth [mm]."""
 
     value: float
     is_found: bool = True
     fit: float = 1.0
+    uncertain: bool = False
 
     @property
     def found(self):
         return np.array([True, self.is_found])
 
 
-def take(lost=()):
-    return {frame: Pose(float(frame), frame not in lost) for frame in FRAMES}
+@dataclass
+class Tracker:
+    """Yield poses that move with the frame number, or given others; record what is asked for.
+
+    If `start` is given, the others are yielded from there only.
+    """
+
+    others: dict = field(default_factory=dict)
+    start: float | None = None
+    asked: list = field(default_factory=list)
+
+    def __call__(self, way, pose):
+        self.asked.append((pose.value, list(way)))
+        others = self.others if self.start in (None, pose.value) else {}
+        return iter([others.get(frame, Pose(float(frame))) for frame in way])
+
+
+def of_frames(**given):
+    return TwoWays(FRAMES, lambda pose: np.array([[pose.value, 0.0, 0.0]]), lambda pose: pose.fit, 1.05, **given)
+
+
+def take(lost=(), wrong=None):
+    known = {frame: Pose(float(frame), frame not in lost) for frame in FRAMES} | (wrong or {})
+    return of_frames(known=known)
 
 
 def replaced(known, others):
     way = range(min(others), max(others) + 1)
-    return replace_poses(
-        way,
-        (others[frame] for frame in way),
-        known,
-        lambda other, before: abs(other.value - before.value) < 0.1,
-        lambda other, before: other.fit > before.fit,
-    )
+    return known.replace(way, iter([others[frame] for frame in way]))
+
+
+def values(known):
+    return {frame: pose.value for frame, pose in known.known.items()}
 
 
 def test_stretches_of_three_lost_frames_or_more_are_searched():
-    known = take([10, 12, 13, 16, 17, 18, 27, 28, 29])
+    known = take([10, 12, 13, 16, 17, 18, 27, 28, 29]).known
     assert lost_stretches(known, FRAMES) == [range(16, 19), range(27, 30)]
     assert nearest_found(known, range(16, 19)).value == 15.0
     assert nearest_found(known, range(10, 11)).value == 11.0
@@ -48,50 +70,86 @@ def test_stretches_of_three_lost_frames_or_more_are_searched():
 def test_every_stretch_is_searched_once_and_what_is_left_of_it_again():
     """A search in 14 to 23 finds the teeth from 20 on; there is nothing to find before."""
     known, searched = take(range(14, 24)), []
+    tracker = Tracker({frame: Pose(0.0, False) for frame in range(14, 20)})
 
-    def again(lost):
-        searched.append(lost)
-        return {frame: Pose(float(frame)) for frame in range(20, 24)} if 20 in lost else None
+    def search(lost, near):
+        searched.append((lost, near.value))
+        if 20 not in lost:
+            raise TrackingError("no teeth")
+        return Begin(20, Pose(20.0), tracker)
 
-    recover(known, FRAMES, again)
-    assert searched == [range(14, 24), range(14, 20)]
-    assert lost_stretches(known, FRAMES) == [range(14, 20)]
+    known.recover(search)
+    assert searched == [(range(14, 24), 13.0), (range(14, 20), 13.0)]
+    assert lost_stretches(known.known, FRAMES) == [range(14, 20)]
 
 
 def test_a_take_without_any_teeth_is_left_alone():
     known = take(FRAMES)
-    recover(known, FRAMES, lambda lost: nearest_found(known, lost))
-    assert lost_stretches(known, FRAMES) == [FRAMES]
+    known.recover(lambda lost, near: pytest.fail("nothing to start from"))
+    assert lost_stretches(known.known, FRAMES) == [FRAMES]
+
+
+@pytest.mark.parametrize(("other", "kept"), [([], True), ([13], True), ([13, 17], False)])
+def test_what_a_search_finds_is_discarded_if_it_only_contradicts(other, kept):
+    """Lost in 14 to 16; the teeth found in 15 are followed to the known poses of 13 and 17."""
+    known = take([14, 15, 16])
+    before = values(known)
+    tracker = Tracker({frame: Pose(9.0) for frame in other})
+    known.recover(lambda lost, near: Begin(15, Pose(15.0, fit=2.0), tracker))
+    assert (lost_stretches(known.known, FRAMES) == []) is kept
+    assert kept or values(known) == before
 
 
 def test_equal_poses_end_a_replacement():
     known = take([20, 21, 22])
     assert replaced(known, {frame: Pose(float(frame)) for frame in range(20, 28)}) is True
-    assert not lost_stretches(known, FRAMES)
+    assert not lost_stretches(known.known, FRAMES)
 
 
-@pytest.mark.parametrize(("fit", "ended"), [(0.9, False), (1.1, None)])
+@pytest.mark.parametrize(("fit", "ended"), [(1.04, False), (1.1, None)])
 def test_different_poses_are_replaced_by_better_ones_only(fit, ended):
     known = take()
     assert replaced(known, {frame: Pose(-1.0, fit=fit) for frame in range(20, 25)}) is ended
-    assert [known[frame].value for frame in range(20, 25)] == ([20, 21, 22, 23, 24] if ended is False else [-1] * 5)
+    assert [known.known[frame].value for frame in range(20, 25)] == (
+        [20, 21, 22, 23, 24] if ended is False else [-1] * 5
+    )
+
+
+def test_uncertain_poses_keep_the_better_fit():
+    known = take(wrong={21: Pose(0.0, fit=2.0, uncertain=True), 22: Pose(0.0, fit=0.5, uncertain=True)})
+    known.known[20].is_found = False
+    assert replaced(known, {frame: Pose(float(frame)) for frame in range(20, 28)}) is True
+    assert [known.known[frame].value for frame in (20, 21, 22, 23)] == [20.0, 0.0, 22.0, 23.0]
 
 
 def test_a_lost_frame_ends_a_replacement():
     known = take([20, 21, 22])
     assert replaced(known, {20: Pose(20.0), 21: Pose(21.0, False), 22: Pose(22.0)}) is None
-    assert [bool(known[frame].found.all()) for frame in (20, 21, 22)] == [True, False, False]
+    assert [bool(known.known[frame].found.all()) for frame in (20, 21, 22)] == [True, False, False]
 
 
-@pytest.mark.parametrize(
-    ("meetings", "wrong"),
-    [
-        ((True, True), False),
-        ((True, False), False),
-        ((None, None), False),
-        ((None, False), True),
-        ((False, False), True),
-    ],
-)
-def test_poses_that_only_contradict_others_are_refused(meetings, wrong):
-    assert contradicts(list(meetings)) is wrong
+@pytest.mark.parametrize("step", [1, -1])
+def test_teeth_are_followed_back_from_where_they_were_found(step):
+    """Lost from the third frame on, and found in the eighth: the frames before it are followed again."""
+    start = FRAMES[0] if step > 0 else FRAMES[-1]
+    way = range(start + step, FRAMES[10] + step, step)
+    tracker = Tracker({frame: Pose(float(frame), False) for frame in way[2:7]}, start)
+    known = of_frames()
+    known.follow(Begin(start, Pose(float(start)), tracker))
+    assert [asked for asked in tracker.asked if asked[0] != start] == [(way[7], list(way[6::-1]))]
+    assert not lost_stretches(known.known, FRAMES, 1)
+
+
+def test_a_jaw_that_jumps_is_followed_back():
+    """Wrong from 18 to 21: the poses that jump are followed back, and the correct ones replace the wrong ones."""
+    tracker = Tracker({frame: Pose(frame + 2.0, fit=0.5) for frame in range(18, 22)}, 10)
+    known = of_frames()
+    known.follow(Begin(10, Pose(10.0), tracker))
+    assert values(known) == {frame: float(frame) for frame in FRAMES}
+
+
+def test_progress_counts_the_frames_followed():
+    told = []
+    known = of_frames(progress=lambda *step: told.append(step))
+    known.follow(Begin(15, Pose(15.0), Tracker()))
+    assert told == [(k, 20) for k in range(1, 21)]

@@ -19,13 +19,12 @@ from jawusd.segmentation.picture import ColourFootage
 from jawusd.tracking.contour.samples import COLUMNS, INVERSE_DEPTH, LENGTH, NX, NY, U, V, X, Y
 from jawusd.tracking.contour.scan import CROWN, prepare_scan
 from jawusd.tracking.contour.views import Drawn
-from jawusd.tracking.region import performance, rig_tracker
+from jawusd.tracking.region import rig_tracker
 from jawusd.tracking.region import tracker as region_tracker
 from jawusd.tracking.region.colours import BINS, PATCHES, TABLES, Areas, CameraColours, colour_bins
 from jawusd.tracking.region.creases import search_creases
 from jawusd.tracking.region.edges import _light, search_borders, sharpen
 from jawusd.tracking.region.effort import THOROUGH
-from jawusd.tracking.region.performance import follow_back
 from jawusd.tracking.region.rig_tracker import RigTracker
 from jawusd.tracking.region.view import Counts, RegionView
 from jawusd.tracking.sequence.guided import GuidedTracker
@@ -224,37 +223,6 @@ class Covered(ColourFootage):
             for _, pictures in super().walk(range(instead or frame, (instead or frame) + 1)):
                 skin = {name: np.full_like(image, (190, 130, 110)) for name, image in pictures.items()}
                 yield frame, skin if instead is None else pictures
-
-
-def fit_of(by, found, px, uncertain=False):
-    return SimpleNamespace(by=by, found=np.array([True, found]), solution=np.array([px]), uncertain=uncertain)
-
-
-@pytest.mark.parametrize("step", [1, -1])
-def test_teeth_are_followed_back_from_where_they_were_found(monkeypatch, step):
-    """Lost from the 3rd frame, visible again from the 5th, found in the 8th; lost from the 9th to the end."""
-    monkeypatch.setattr(performance, "score_px", np.asarray)
-    way = range(30, 30 + 10 * step, step)
-    fits = {at: fit_of("first", k < 3 or k == 8, 9.0) for k, at in enumerate(way)}
-    asked, looked = [], []
-
-    def back(frame, before):
-        asked.append((frame, list(before)))
-        for at in before:
-            looked.append(at)
-            yield fit_of("back", at in way[5:8], 5.0)
-
-    follow_back(fits, way, back)
-    assert asked == [(way[8], list(way[7::-1]))] and looked == list(way[7:3:-1])
-    assert [fits[at].by for at in way] == ["first"] * 5 + ["back"] * 3 + ["first"] * 2
-
-
-def test_a_wrong_pose_is_replaced_up_to_where_the_right_one_fits_hardly_better(monkeypatch):
-    """Wrong from frame 2, but uncertain only in 3, where it fits better anyway, and in 5; correct from frame 6."""
-    monkeypatch.setattr(performance, "score_px", np.asarray)
-    fits = {k: fit_of("first", True, 7.0 if k == 3 else 5.0, k in (3, 5)) for k in range(8)}
-    follow_back(fits, range(8), lambda frame, before: (fit_of("back", True, 6.0 if at > 1 else 5.2) for at in before))
-    assert [fits[k].by for k in range(8)] == ["first", "first", "back", "first", "back", "back", "first", "first"]
 
 
 def test_a_jaw_that_is_lost_slowly_does_not_get_usual():

@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
-from itertools import pairwise
 
 import numpy as np
 
 from jawusd.base.arrays import Array
-from jawusd.base.errors import TrackingError
 from jawusd.evaluator import JawRig
 from jawusd.evaluator.skin import SkinJaw
 from jawusd.formats.performance import Performance
-from jawusd.geometry import Camera
+from jawusd.geometry import Camera, transform_points
 from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.contour.annotator import AnnotatorPrior
 from jawusd.tracking.contour.quality import score_px
@@ -28,7 +25,7 @@ from jawusd.tracking.performance.results import performance_of
 from jawusd.tracking.performance.skin import SkinOf, jaw_of_skin
 from jawusd.tracking.performance.smoother import WIDER, Smoothed, Smoother, with_one_head
 from jawusd.tracking.region.appearance import Cut, LearnedColours
-from jawusd.tracking.region.recovery import both_ways, contradicts, nearest_found, recover, replace_poses
+from jawusd.tracking.region.recovery import Begin, TwoWays
 from jawusd.tracking.region.rig_tracker import RigTracker
 from jawusd.tracking.region.search import fitting_share
 
@@ -53,8 +50,6 @@ _BORDERS = AnnotatorPrior(common=(0.0, 0.0, 0.0), arch=(0.4, 0.08, 0.02), camera
 _CORRELATION_PX = 80.0
 _ALONE = 2.0  # factor on the variance for a single camera [-], since no other view reveals shifted borders
 _CLEARLY = 1.05  # minimum ratio of matched contour for another pose to replace a trusted one
-# maximum difference of jaw parameters of equal poses [mm]
-_SAME_MM = 0.15
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,7 +117,7 @@ class PictureTake:
         Raises:
             CaptureError: an image cannot be decoded.
         """
-        fit = self._tracker(self._shot.cameras, 1.0).begin(self._first_cut(self._shot.cameras, frame, near), near)
+        fit = self._begin(self._shot.cameras, 1.0, frame, near).pose
         solution = fit.solution
         if solution is None or not fit.found.all():
             return fit.pose, 0.0
@@ -141,9 +136,7 @@ class PictureTake:
         shot = self._shot
         cameras, start, factors = self._known_before(frame, start, progress)
         head = KNOWN if shot.fixed_head else 1.0
-        known = dict(zip(shot.frames, self._follow(cameras, (frame, start), shot.frames, head, progress), strict=True))
-        recover(known, shot.frames, lambda lost: self._followed_from(lost, cameras, head, known))
-        fits = [known[frame] for frame in shot.frames]
+        fits = self._follow(cameras, (frame, start), shot.frames, head, progress, recover=True)
         smoothed = self._smoothed(shot.frames, fits, jaw_of_skin(shot.skin, shot.frames, fits))
         if shot.free_focal:
             log_focal = smoothed.state.log_focal + np.log(factors)
@@ -171,59 +164,47 @@ class PictureTake:
             start = fits[some.index(at)].pose
         return cameras, start, factors
 
-    def _tracker(self, cameras: Sequence[Camera], head: float) -> RigTracker:
+    def _begin(self, cameras: Sequence[Camera], head: float, at: int, near: Pose) -> Begin[FrameFit]:
+        """Return the fit of a frame near a guess, from which a take can be followed."""
         colours = LearnedColours(self._scans, cameras, self._axes)
-        free_focal = self._shot.free_focal
-        return RigTracker(self._rough, colours, head=head, free_focal=free_focal, whole=self._instants)
+        tracker = RigTracker(self._rough, colours, head=head, free_focal=self._shot.free_focal, whole=self._instants)
+        fit = tracker.begin(next(self._shot.cuts(cameras, self._centre(near), range(at, at + 1))), near)
 
-    def _first_cut(self, cameras: Sequence[Camera], frame: int, near: Pose) -> Cut:
-        return next(iter(self._shot.cuts(cameras, self._centre(near), range(frame, frame + 1))))
+        def follow(way: range, begin: FrameFit) -> Iterator[FrameFit]:
+            return map(tracker.reversed_from(begin).step, self._shot.cuts(cameras, self._centre(begin.pose), way))
+
+        return Begin(at, fit, follow)
 
     def _centre(self, pose: Pose) -> Array:
         return teeth_centre(self._scans, self.coordinates.arches(pose))
 
     def _follow(
-        self, cameras: Sequence[Camera], start: tuple[int, Pose], frames: range, head: float, progress: Progress
+        self,
+        cameras: Sequence[Camera],
+        start: tuple[int, Pose],
+        frames: range,
+        head: float,
+        progress: Progress,
+        recover: bool = False,
     ) -> list[FrameFit]:
-        """Return the fits of frames, tracked from an initial pose in both directions."""
-        at, pose = start
-        tracker = self._tracker(cameras, head)
-        fits = {at: tracker.begin(self._first_cut(cameras, at, pose), pose)}
-        back = tracker.reversed_from(fits[at])
-        for way, one in ((range(at + 1, frames.stop), tracker), (range(at - 1, frames.start - 1, -1), back)):
-            for frame, cut in zip(way, self._shot.cuts(cameras, self._centre(pose), way), strict=True):
-                fits[frame] = one.step(cut)
-                progress(len(fits), len(frames))
-            follow_back(fits, way, partial(self._turned, cameras, one, fits))
-        return [fits[frame] for frame in frames]
+        """Return the fits of frames, tracked from an initial pose in both directions.
 
-    def _followed_from(
-        self, lost: range, cameras: Sequence[Camera], head: float, known: Mapping[int, FrameFit]
-    ) -> dict[int, FrameFit] | None:
-        """Return all fits after a search in lost frames; None if the search fails or contradicts the known fits."""
-        head_pose = self.coordinates.arches(nearest_found(known, lost).pose)[0]
-        try:
-            frame, pose = self._shot.find(lost, head_pose[:3, :3] @ self._axes[1])
-        except TrackingError:
-            return None
-        tracker = self._tracker(cameras, head)
-        begin = tracker.begin(self._first_cut(cameras, frame, pose), pose)
-        if not begin.found.all():
-            return None
-        again, back = {**known, frame: begin}, tracker.reversed_from(begin)
-        meetings = []
-        for way, one in zip(both_ways(frame, self._shot.frames), (tracker, back), strict=True):
-            followed = map(one.step, self._shot.cuts(cameras, self._centre(pose), way))
-            meetings.append(replace_poses(way, followed, again, _same, _better))
-        return None if contradicts(meetings) else again
+        Args:
+            recover: whether to search for the teeth where they stay lost.
+        """
 
-    def _turned(
-        self, cameras: Sequence[Camera], one: RigTracker, fits: dict[int, FrameFit], frame: int, before: range
-    ) -> Iterator[FrameFit]:
-        """Yield the fits of frames, tracked from one frame in the direction opposite to that of a tracker."""
-        turned = one.reversed_from(fits[frame])
-        for cut in self._shot.cuts(cameras, self._centre(fits[frame].pose), before):
-            yield turned.step(cut)
+        def search(lost: range, near: FrameFit) -> Begin[FrameFit]:
+            return self._begin(cameras, head, *self._shot.find(lost, near.pose.head[:3, :3] @ self._axes[1]))
+
+        take = TwoWays(frames, self._places, _fitting_px, _CLEARLY, progress)
+        begin = self._begin(cameras, head, *start)
+        take.follow(begin)
+        if recover:
+            take.recover(search)
+        return [take.known[frame] for frame in frames]
+
+    def _places(self, fit: FrameFit) -> Array:
+        return transform_points(self._jaw.pose(fit.pose.d), self._scans[1].probes)
 
     def _smoothed(self, frames: range, fits: Sequence[FrameFit], skin: SkinJaw | None = None) -> Smoothed:
         """Refine all frames jointly."""
@@ -242,44 +223,6 @@ class PictureTake:
             skin=skin,
         )
         return smoother.run(fits)
-
-
-def follow_back(fits: dict[int, FrameFit], way: range, back: Callable[[int, range], Iterator[FrameFit]]) -> None:
-    """Track backwards into frames in which teeth were not found or the fit is uncertain; keep the better fits.
-
-    Teeth may be visible for some frames before a search finds them, and a wrong pose is often corrected only some
-    frames later.
-
-    Args:
-        fits: fits by frame, updated in place. Backward tracking starts at each frame that is more trusted than its
-            predecessor, and ends when the teeth are lost or when a trusted frame is not fitted clearly better.
-        way: frames in tracking order.
-        back: function that yields the fits of a range of frames, tracked from a given frame.
-    """
-    for last, frame in pairwise(way):
-        if _trust(fits[frame]) <= _trust(fits[last]):
-            continue
-        before = range(last, way.start - way.step, -way.step)
-        for at, fit in zip(before, back(frame, before), strict=False):
-            old = fits[at]
-            if not fit.found.all() or not _better(fit, old):
-                break
-            fits[at] = max(old, fit, key=lambda one: (one.found.sum(), _fitting_px(one)))
-
-
-def _same(fit: FrameFit, old: FrameFit) -> bool:
-    """Return whether a fit confirms a trusted one."""
-    return _trust(old) == 2 and bool(np.abs(fit.pose.d - old.pose.d).max() < _SAME_MM)
-
-
-def _better(fit: FrameFit, old: FrameFit) -> bool:
-    """Return whether a fit may replace another, which must be untrusted or match clearly less contour."""
-    return _trust(old) < 2 or _fitting_px(fit) >= _CLEARLY * _fitting_px(old)
-
-
-def _trust(fit: FrameFit) -> int:
-    """Return the trust in a fit: 0 if the teeth were not found, 1 if the fit is uncertain, 2 otherwise."""
-    return int(fit.found.all()) * (1 if fit.uncertain else 2)
 
 
 def _fitting_px(fit: FrameFit) -> float:

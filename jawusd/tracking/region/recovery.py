@@ -1,15 +1,21 @@
-"""Search for teeth that stay lost, and track them forwards and backwards until their poses agree with known ones."""
+"""Follow the teeth through a take in both directions, judge poses by later ones, and search where teeth stay lost."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from typing import Protocol, TypeVar
+from dataclasses import dataclass, field
+from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 
-from jawusd.base.arrays import Mask
+from jawusd.base.arrays import Array, Mask
+from jawusd.base.errors import TrackingError
 
 _SHORTEST_LOSS = 3  # minimum number of successive lost frames in which the teeth are searched for
+_SAME_MM = 0.15  # distance of lower teeth below which two poses of a frame count as equal
+# Second difference of the motion of lower teeth above which earlier frames are followed again [mm]. Speech and chewing
+# reach 1 mm at 24 fps; a false positive costs the time of one frame.
+_JUMP_MM = 0.8
 
 
 class Located(Protocol):
@@ -19,34 +25,148 @@ class Located(Protocol):
     def found(self) -> Mask:
         """Whether each arch was found, shape (2,)."""
 
+    @property
+    def uncertain(self) -> bool:
+        """Whether less of the contour fits than usual, so that the poses may be wrong."""
+
 
 P = TypeVar("P", bound=Located)
 
 
-def recover(known: dict[int, P], frames: range, again: Callable[[range], Mapping[int, P] | None]) -> None:
-    """Update poses where the teeth were lost for several frames; without any found poses, nothing is done.
+@dataclass(frozen=True, eq=False)
+class Begin(Generic[P]):
+    """A frame from which a take is followed.
 
-    Args:
-        known: poses by frame, updated in place.
-        frames: all frames.
-        again: function that searches in lost frames; returns the poses of all frames, or None if nothing was found.
+    Attributes:
+        frame, pose: the frame and its pose.
+        follow: yields the poses of frames in tracking order, next to a given pose. Every call starts with the colours
+            learned in the first frame.
     """
-    if not any(pose.found.all() for pose in known.values()):
-        return
-    vain: set[int] = set()
-    while lost := next((s for s in lost_stretches(known, frames) if s.start not in vain), None):
-        found = again(lost)
-        if found is None:
-            vain.update(lost)
-        else:
-            known.update(found)
+
+    frame: int
+    pose: P
+    follow: Callable[[range, P], Iterator[P]]
 
 
-def lost_stretches(known: Mapping[int, P], frames: range) -> list[range]:
+@dataclass(eq=False)
+class TwoWays(Generic[P]):
+    """Poses of a take, followed in both directions.
+
+    Attributes:
+        frames: all frames.
+        places: returns points of the lower teeth in the frame of the upper teeth [mm], shape (N, 3).
+        fit_px: returns the length of the contour that fits a pose [px].
+        margin: ratio of these lengths above which another pose replaces a trusted one.
+        progress: called with the number of frames followed and the total.
+        known: poses by frame.
+    """
+
+    frames: range
+    places: Callable[[P], Array]
+    fit_px: Callable[[P], float]
+    margin: float = 1.0
+    progress: Callable[[int, int], None] = lambda done, total: None
+    known: dict[int, P] = field(default_factory=dict)
+
+    def follow(self, begin: Begin[P]) -> None:
+        """Follow the teeth from one frame to both ends, and back from frames by which earlier ones can be judged.
+
+        Where a tracker recovers, its poses were wrong before, although each is plausible by itself.
+        """
+        self.known[begin.frame] = begin.pose
+        self.progress(1, len(self.frames))
+        for way in both_ways(begin.frame, self.frames):
+            for frame, pose in zip(way, begin.follow(way, begin.pose), strict=True):
+                self.known[frame] = pose
+                self.progress(len(self.known), len(self.frames))
+            for frame in self._turning_points(way):
+                before = range(frame - way.step, begin.frame, -way.step)
+                self.replace(before, begin.follow(before, self.known[frame]))
+
+    def recover(self, search: Callable[[range, P], Begin[P]]) -> None:
+        """Search where the teeth were lost for several frames; without any found poses, nothing is done.
+
+        What is found is followed both ways, and discarded if it contradicts known poses and agrees with none.
+
+        Args:
+            search: searches in lost frames, given the nearest found pose. Raises TrackingError if it finds nothing.
+        """
+        if not any(pose.found.all() for pose in self.known.values()):
+            return
+        vain: set[int] = set()
+        while lost := next((s for s in lost_stretches(self.known, self.frames) if s.start not in vain), None):
+            before = dict(self.known)
+            try:
+                begin = search(lost, nearest_found(self.known, lost))
+            except TrackingError:
+                vain.update(lost)
+                continue
+            if not begin.pose.found.all() or not self._joined(begin):
+                self.known = before
+                vain.update(lost)
+
+    def _joined(self, begin: Begin[P]) -> bool:
+        """Replace poses from a frame on, both ways; return whether that does not contradict what is known."""
+        self.known[begin.frame] = begin.pose
+        ways = both_ways(begin.frame, self.frames)
+        meetings = [self.replace(way, begin.follow(way, begin.pose)) for way in ways]
+        return False not in meetings or True in meetings
+
+    def replace(self, way: range, followed: Iterator[P]) -> bool | None:
+        """Replace poses by others of the same frames, as long as the two differ and the latter are better.
+
+        A pose that is trusted is replaced if the other fits better, an uncertain one keeps the better fit of both.
+
+        Args:
+            way: frames in tracking order.
+            followed: other poses of these frames.
+
+        Returns:
+            True if an equal trusted pose was met, False if a different one that fits better, None if the arches were
+            lost or the take ended.
+        """
+        for frame, other in zip(way, followed, strict=False):
+            if not other.found.all():
+                return None
+            old = self.known[frame]
+            if trust(old) == 2:
+                if self._apart_mm(other, old) < _SAME_MM:
+                    return True
+                if self.fit_px(other) <= self.margin * self.fit_px(old):
+                    return False
+            self.known[frame] = max(other, old, key=lambda pose: (pose.found.sum(), self.fit_px(pose)))
+        return None
+
+    def _turning_points(self, way: range) -> Iterator[int]:
+        """Yield the frames that are trusted more than their predecessor, or at which the jaw accelerates implausibly.
+
+        Poses may be replaced in the meantime.
+        """
+        for k in range(1, len(way)):
+            jumps = k > 1 and self._bend_mm(way[k - 2 : k + 1]) > _JUMP_MM
+            if jumps or trust(self.known[way[k]]) > trust(self.known[way[k - 1]]):
+                yield way[k]
+
+    def _apart_mm(self, one: P, other: P) -> float:
+        """Return the mean distance between the lower teeth at two poses of a frame [mm]."""
+        return float(np.linalg.norm(self.places(one) - self.places(other), axis=-1).mean())
+
+    def _bend_mm(self, frames: range) -> float:
+        """Return the mean second difference of the motion of the lower teeth in three successive frames [mm]."""
+        places = np.stack([self.places(self.known[frame]) for frame in frames])
+        return float(np.linalg.norm(np.diff(places, 2, axis=0), axis=-1).mean())
+
+
+def trust(pose: Located) -> int:
+    """Return the trust in a pose: 0 if the teeth were not found, 1 if it is uncertain, 2 otherwise."""
+    return int(pose.found.all()) * (1 if pose.uncertain else 2)
+
+
+def lost_stretches(known: Mapping[int, P], frames: range, shortest: int = _SHORTEST_LOSS) -> list[range]:
     """Return the runs of successive frames on which an arch was not found, except very short ones."""
     found = np.array([known[frame].found.all() for frame in frames])
     edges = np.flatnonzero(np.diff(np.concatenate([[True], found, [True]]).astype(int))).reshape(-1, 2).tolist()
-    return [frames[first:stop] for first, stop in edges if stop - first >= _SHORTEST_LOSS]
+    return [frames[first:stop] for first, stop in edges if stop - first >= shortest]
 
 
 def nearest_found(known: Mapping[int, P], lost: range) -> P:
@@ -57,41 +177,3 @@ def nearest_found(known: Mapping[int, P], lost: range) -> P:
 def both_ways(frame: int, frames: range) -> tuple[range, range]:
     """Return the frames after and before a frame, each in the order in which they are tracked."""
     return range(frame + 1, frames.stop), range(frame - 1, frames.start - 1, -1)
-
-
-def replace_poses(
-    way: range,
-    followed: Iterator[P],
-    known: dict[int, P],
-    same: Callable[[P, P], bool],
-    better: Callable[[P, P], bool],
-) -> bool | None:
-    """Replace known poses by newly tracked ones, frame by frame, while the new ones differ and are better.
-
-    Before a tracker recovers or loses the teeth, its poses may be wrong although each is plausible by itself.
-
-    Args:
-        way: frames in tracking order.
-        followed: newly tracked poses of these frames.
-        known: poses by frame, updated in place.
-        same, better: functions that compare a new pose with a known one.
-
-    Returns:
-        True if a known pose agrees with the new one, False if a known pose differs and is not worse, None if the arches
-        were lost or the take ended first.
-    """
-    for frame, other in zip(way, followed, strict=False):
-        if not other.found.all():
-            return None
-        if known[frame].found.all():
-            if same(other, known[frame]):
-                return True
-            if not better(other, known[frame]):
-                return False
-        known[frame] = other
-    return None
-
-
-def contradicts(meetings: list[bool | None]) -> bool:
-    """Return whether the results of `replace_poses` in both directions include a contradiction but no agreement."""
-    return False in meetings and True not in meetings

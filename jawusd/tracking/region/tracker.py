@@ -47,6 +47,11 @@ class RegionPose:
     # minimum of `usual` for an arch to count as found, shape (2,)
     least: Array = field(default_factory=lambda: np.zeros(2))
 
+    @property
+    def uncertain(self) -> bool:
+        """Whether less of the contour fits than usual, so that the poses may be wrong."""
+        return bool((self.usual < _UNCERTAIN).any())
+
 
 class RegionTracker:
     """Tracker of both arches in images of several cameras; colours are learned while tracking."""
