@@ -156,8 +156,11 @@ class Follower:
         take = TwoWays(frames, places, lambda found: found.objective_px, progress=partial(progress, STAGE))
         self.sampled_views.clear()
         self._wanted = set(np.linspace(frames.start, frames.stop - 1, _SAMPLED_VIEWS).astype(int).tolist())
-        take.follow(self._begin)
+        begin = self._begin
+        take.follow(begin)
         take.recover(search)
+        for frame, least_mm in take.unconfirmed(begin.follow).items():
+            take.known[frame] = take.known[frame].unconfirmed(least_mm, points[0])
         return take.known
 
     def _walk(self, tracker: RegionTracker, cutter: Cutter, way: range, near: RegionPose) -> Iterator[RegionPose]:

@@ -1,5 +1,7 @@
 """Fusion of a take's poses with its condylar motion, on joints that are not polynomial."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -15,7 +17,9 @@ from jawusd.geometry import (
 )
 from jawusd.synthetic.exercises import record
 from jawusd.synthetic.person import Person
+from jawusd.tracking.contour.quality import landmark_sigmas, relative_covariance
 from jawusd.tracking.region.condyle_fusion import CondyleFusion
+from jawusd.tracking.region.tracker import RegionPose
 
 HEAD = make_transform(so3_exp(np.array([0.3, -2.0, 0.4])), [12.0, -30.0, 210.0])
 AXES = so3_exp(np.array([0.1, 0.2, -0.3]))  # of a scan that is not in anatomical axes
@@ -99,3 +103,25 @@ def test_frames_whose_condyles_are_out_of_the_way_claim_less():
     ratio = np.trace(between, axis1=1, axis2=2) / np.trace(usual, axis1=1, axis2=2)
     assert ratio[60] > 2.0
     assert np.delete(ratio, 60) == pytest.approx(1.0, abs=0.1)
+
+
+def test_unconfirmed_frames_keep_their_least_sigma():
+    """The fusion makes the incisal point more certain, but not in frames that nothing confirms."""
+    take, least_mm = Take(26), np.zeros(FRAMES)
+    least_mm[[40, 41]] = 0.5, 2.0
+    poses, covariance, between = take.fuse(take.poses, take.covariance, take.between)
+    again = replace(take.fuse, least_mm=least_mm)(take.poses, take.covariance, take.between)
+    sigma = landmark_sigmas(relative_pose(*again[0].swapaxes(0, 1)), again[2], take.landmarks)[:, 0]
+    assert sigma[[40, 41]] == pytest.approx([0.5, 2.0]) and np.delete(sigma, [40, 41]).max() < 0.45
+    wider = again[2] / between
+    assert np.array_equal(again[0], poses) and again[1] == pytest.approx(covariance * wider[:, None, :1, :1])
+
+
+def test_poses_that_nothing_confirms_become_uncertain_as_a_whole():
+    take = Take(27)
+    sure = RegionPose(take.poses[0], np.ones(2, bool), take.covariance[0])
+    unsure = sure.unconfirmed(3.0, take.landmarks[0])
+    between = relative_covariance(sure.poses[0], *unsure.covariance)
+    assert landmark_sigmas(relative_pose(*sure.poses), between, take.landmarks)[0] == pytest.approx(3.0)
+    assert unsure.least_mm == 3.0 and np.array_equal(unsure.poses, sure.poses)
+    assert np.array_equal(sure.unconfirmed(1e-3, take.landmarks[0]).covariance, sure.covariance)

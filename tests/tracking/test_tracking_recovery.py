@@ -153,3 +153,24 @@ def test_progress_counts_the_frames_followed():
     known = of_frames(progress=lambda *step: told.append(step))
     known.follow(Begin(15, Pose(15.0), Tracker()))
     assert told == [(k, 20) for k in range(1, 21)]
+
+
+def test_poses_that_nothing_confirms_are_uncertain():
+    """Lost from 20 on, wrong from 17 on; the way back differs there, and agrees with 16."""
+    known = take(range(20, 30), {frame: Pose(frame + 3.0) for frame in (17, 18, 19)})
+    tracker = Tracker({18: Pose(21.5), 17: Pose(18.0)})
+    assert known.unconfirmed(tracker) == pytest.approx({19: 0.5, 18: 0.5, 17: 2.0})
+    assert tracker.asked == [(22.0, list(range(18, 9, -1)))]
+
+
+@pytest.mark.parametrize(("fit", "doubted"), [(1.0, [17, 18, 19]), (1.1, [18, 19])])
+def test_a_pose_that_fits_clearly_better_needs_no_confirmation(fit, doubted):
+    known = take(range(20, 30), {17: Pose(17.0, fit=fit)})
+    assert sorted(known.unconfirmed(Tracker({18: Pose(21.5), 17: Pose(18.0)}))) == doubted
+
+
+def test_both_sides_of_a_loss_are_uncertain():
+    known = take([20, 21])
+    assert known.unconfirmed(Tracker()) == {19: 0.5, 22: 0.5}
+    known.known[19] = Pose(23.0)  # 4 mm from the motion of its neighbours
+    assert known.unconfirmed(Tracker()) == {19: 4.0, 22: 0.5}

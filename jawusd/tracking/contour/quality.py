@@ -184,3 +184,13 @@ def landmark_sigmas(T_upper_lower: Array, covariance: Array, landmarks: Array) -
     points = transform_points(T_upper_lower, landmarks)
     J = np.concatenate([-hat(points), np.broadcast_to(np.eye(3), (*points.shape, 3))], axis=-1)
     return np.sqrt(np.einsum("...lij,...jk,...lik->...l", J, covariance, J))
+
+
+def widening(T_upper_lower: Array, covariance: Array, landmark: Array, least_mm: Array | float) -> Array:
+    """Return the factors >= 1 on covariances that give a landmark (3,) at least a standard deviation, shape (...).
+
+    `T_upper_lower` and `covariance` are as in `landmark_sigmas`; `least_mm` is 0 where nothing is to change. Unknown
+    covariances give 1.
+    """
+    sigma = landmark_sigmas(T_upper_lower, covariance, landmark[None])[..., 0]
+    return np.asarray(np.fmax(np.square(least_mm / sigma), 1.0))

@@ -16,7 +16,7 @@ import numpy as np
 from jawusd.base.arrays import Array
 from jawusd.formats.tracks import Tracks
 from jawusd.geometry import orthonormalise, relative_pose, se3_adjoint, se3_exp
-from jawusd.tracking.contour.quality import landmark_sigmas
+from jawusd.tracking.contour.quality import landmark_sigmas, widening
 from jawusd.tracking.region.jaw_priors import CondyleMotion
 
 _STRAINED = 2.0  # squared Mahalanobis distance of the condyles, per coordinate, above which a frame is implausible
@@ -69,10 +69,12 @@ class CondyleFusion:
 
     Attributes:
         landmarks, axes: as in `CondyleMotion`.
+        least_mm: minimum standard deviations of the incisal point after the fusion [mm], shape (F,); default: none.
     """
 
     landmarks: Array
     axes: Array
+    least_mm: Array | None = None
 
     def __call__(self, poses: Array, covariance: Array, between: Array) -> tuple[Array, Array, Array]:
         """Return the fused poses and covariances; covariances of implausible frames are inflated first.
@@ -97,6 +99,11 @@ class CondyleFusion:
             twist, left = _fused(motion, T_upper_lower, between[k])
             poses[k], covariance[k] = _shared(poses[k], covariance[k], twist, between[k] - left)
             between[k] = left
+        if self.least_mm is not None:
+            relative = relative_pose(poses[known, 0], poses[known, 1])
+            wider = widening(relative, between[known], self.landmarks[0], self.least_mm[known])
+            between[known] *= wider[:, None, None]
+            covariance[known] *= wider[:, None, None, None]
         return poses, covariance, between
 
 

@@ -49,6 +49,7 @@ _FIRST_FRAMES, _FOCAL_ROUNDS = 120, 3
 _BORDERS = AnnotatorPrior(common=(0.0, 0.0, 0.0), arch=(0.4, 0.08, 0.02), camera=(0.0, 0.0), frames=5.0)
 _CORRELATION_PX = 80.0
 _ALONE = 2.0  # factor on the variance for a single camera [-], since no other view reveals shifted borders
+_OFF_MM = 1.0  # possible error of an unconfirmed pose beside a loss above which the pose is left out
 _CLEARLY = 1.05  # minimum ratio of matched contour for another pose to replace a trusted one
 
 
@@ -190,7 +191,8 @@ class PictureTake:
         """Return the fits of frames, tracked from an initial pose in both directions.
 
         Args:
-            recover: whether to search for the teeth where they stay lost.
+            recover: whether to search for the teeth where they stay lost, and to leave out poses beside losses that
+                nothing confirms.
         """
 
         def search(lost: range, near: FrameFit) -> Begin[FrameFit]:
@@ -201,6 +203,9 @@ class PictureTake:
         take.follow(begin)
         if recover:
             take.recover(search)
+            for frame, least_mm in take.unconfirmed(begin.follow).items():
+                if least_mm > _OFF_MM:
+                    take.known[frame] = replace(take.known[frame], use=np.zeros_like(take.known[frame].use))
         return [take.known[frame] for frame in frames]
 
     def _places(self, fit: FrameFit) -> Array:

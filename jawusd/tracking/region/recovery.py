@@ -16,6 +16,7 @@ _SAME_MM = 0.15  # distance of lower teeth below which two poses of a frame coun
 # Second difference of the motion of lower teeth above which earlier frames are followed again [mm]. Speech and chewing
 # reach 1 mm at 24 fps; a false positive costs the time of one frame.
 _JUMP_MM = 0.8
+_UNCONFIRMED_MM = 0.5  # minimum standard deviation of lower teeth beside a loss, where nothing confirms a pose
 
 
 class Located(Protocol):
@@ -136,6 +137,39 @@ class TwoWays(Generic[P]):
                     return False
             self.known[frame] = max(other, old, key=lambda pose: (pose.found.sum(), self.fit_px(pose)))
         return None
+
+    def unconfirmed(self, follow: Callable[[range, P], Iterator[P]]) -> dict[int, float]:
+        """Return minimum standard deviations of the lower teeth [mm] in frames beside losses, by frame.
+
+        Just before a tracker loses the teeth, or after it has found them, a pose may be wrong although it fits. From
+        the frame beside each loss, the take is followed away from the loss, until a trusted pose is confirmed. Up to
+        there, poses are at least as uncertain as the distances between both, and the first one as its distance from the
+        motion of its neighbours.
+
+        Args:
+            follow: as in `Begin`.
+        """
+        least_mm: dict[int, float] = {}
+        for lost in lost_stretches(self.known, self.frames, shortest=1):
+            for beside, ahead in ((lost.start - 1, 1), (lost.stop, 0)):
+                if beside in self.frames:
+                    for frame, away_mm in self._doubts(beside, both_ways(beside, self.frames)[ahead], follow):
+                        least_mm[frame] = max(away_mm, least_mm.get(frame, _UNCONFIRMED_MM))
+        return least_mm
+
+    def _doubts(
+        self, beside: int, way: range, follow: Callable[[range, P], Iterator[P]]
+    ) -> Iterator[tuple[int, float]]:
+        """Yield frames from one beside a loss to the first confirmed one, and how far their poses may be off [mm]."""
+        near = range(beside, beside + 3 * way.step, way.step)
+        bent = all(frame in self.frames and self.known[frame].found.all() for frame in near)
+        yield beside, self._bend_mm(near) if bent else 0.0
+        for frame, other in zip(way, follow(way, self.known[beside]), strict=False):
+            old, away_mm = self.known[frame], self._apart_mm(other, self.known[frame])
+            clear = away_mm < _SAME_MM or self.fit_px(old) > self.margin * self.fit_px(other)
+            if not (old.found.all() and other.found.all()) or (trust(old) == 2 and clear):
+                return
+            yield frame, away_mm
 
     def _turning_points(self, way: range) -> Iterator[int]:
         """Yield the frames that are trusted more than their predecessor, or at which the jaw accelerates implausibly.

@@ -187,7 +187,8 @@ def tracks_of(
     }
     moved = {f: np.stack([corrected_pose(records, f, arch, nuisances) for arch in ARCHES]) for f in records}
     records = {f: replace(r, solution=replace(r.solution, poses=moved[f])) for f, r in records.items()}
-    fuse = CondyleFusion(take.landmarks, take.axes)
+    least_mm = np.array([followed[frame].least_mm for frame in sorted(records)])
+    fuse = CondyleFusion(take.landmarks, take.axes, least_mm)
     return assemble(records, names, take.landmarks, nuisances, extrinsics, config, rest, notes, fuse)
 
 

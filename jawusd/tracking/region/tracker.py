@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -13,7 +13,13 @@ from jawusd.base.arrays import Array, Mask
 from jawusd.geometry import Camera, relative_pose
 from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.contour.equations import Solution
-from jawusd.tracking.contour.quality import matched_px, relative_covariance, residual_px, twist_covariance
+from jawusd.tracking.contour.quality import (
+    matched_px,
+    relative_covariance,
+    residual_px,
+    twist_covariance,
+    widening,
+)
 from jawusd.tracking.contour.scan import ARCHES, Scan, probe_points
 from jawusd.tracking.contour.views import View
 from jawusd.tracking.region.appearance import CORRELATION_PX, FIRST_RATES, RATES, Cut, LearnedColours, Picture
@@ -46,11 +52,18 @@ class RegionPose:
     usual: Array = field(default_factory=lambda: np.ones(2))
     # minimum of `usual` for an arch to count as found, shape (2,)
     least: Array = field(default_factory=lambda: np.zeros(2))
+    least_mm: float = 0.0  # minimum standard deviation of the incisal point, where nothing confirms the poses [mm]
 
     @property
     def uncertain(self) -> bool:
         """Whether less of the contour fits than usual, so that the poses may be wrong."""
         return bool((self.usual < _UNCERTAIN).any())
+
+    def unconfirmed(self, least_mm: float, incisor: Array) -> RegionPose:
+        """Return the poses with a standard deviation of at least `least_mm` at a point of the lower teeth, (3,)."""
+        between = relative_covariance(self.poses[0], *self.covariance)
+        wider = widening(relative_pose(*self.poses), between, incisor, least_mm)
+        return replace(self, covariance=wider * self.covariance, least_mm=least_mm)
 
 
 class RegionTracker:
