@@ -26,15 +26,19 @@ from jawusd.tracking.sequence.history import MotionPredictor
 _POINTS = 400  # number of scan points at which image colours are read to rank starts
 # Candidate rotations of the jaw about the condyles, up and down and to the side [degrees].
 _OPENED, _ASIDE = (-6.0, -4.5, -3.0, -1.5, 1.5, 3.0, 4.5, 6.0), (-4.0, -2.0, 2.0, 4.0)
-# Candidate positions of the incisal point [mm]: to the left, down, and in front of its path in pure opening. The
-# solver converges from a distance of about 1.7 mm. In an excursion to one side, the jaw rotates about the condyle of
-# that side, so the incisal point moves forward.
-_DOWN = np.arange(0.0, 46.0, 2.5).tolist()
-_LEFT = (-12.0, -9.0, -6.0, -3.0, 3.0, 6.0, 9.0, 12.0)
+# Candidate positions of the incisal point: left, down, and forward of the mean path of plain opening [mm]. The solver
+# converges from about 1.7 mm. In a lateral excursion, the jaw rotates about the condyle of that side, so the point
+# moves forward. Jaws of some subjects open 10 mm in front of the mean path. In three takes with 1,187 frames, 90 % of
+# the frames have a candidate within 2.3, 3.1 and 2.9 mm, and all within 5.6 mm.
+_DOWN = [*np.arange(0.0, 21.0, 2.5).tolist(), *np.arange(24.0, 45.0, 4.0).tolist()]
 _PLACES_MM = [
     *((0.0, down, 0.0) for down in _DOWN),
-    *((left, down, 0.5 * abs(left)) for left in _LEFT for down in (0.0, 2.5, 5.0, 8.0)),
-    *((0.0, down, forward) for down in (2.0, 4.5, 7.0) for forward in (3.5, 7.0)),
+    *((0.0, down, forward) for down in (2.0, 6.0) for forward in (3.5, 7.0)),
+    *((0.0, down, forward) for down in (12.0, 17.0, 22.0, 27.0, 32.0) for forward in (5.0, 10.0)),
+    (0.0, 37.0, 10.0),
+    *((left, down, 0.5 * abs(left)) for left in (-9.0, -6.0, -3.0, 3.0, 6.0, 9.0) for down in (0.0, 4.0, 8.0)),
+    *((left, down, 0.5 * abs(left)) for left in (-6.0, 6.0) for down in (13.0, 18.0)),
+    *((left, down, 0.5 * abs(left)) for left, down in ((-12.0, 0.0), (12.0, 0.0), (-5.0, 24.0), (5.0, 24.0))),
 ]
 # Candidate shifts of the head: left, up and forward [mm].
 _NEAR_MM, _FAR_MM = (-3.0, 0.0, 3.0), (-6.0, 6.0)
