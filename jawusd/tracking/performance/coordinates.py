@@ -24,7 +24,7 @@ from jawusd.geometry import (
 )
 from jawusd.tracking.contour.scan import Scan
 
-HEAD, JAW = slice(0, 6), slice(6, 9)
+HEAD, JAW, OPENING = slice(0, 6), slice(6, 9), 6
 LOCAL = 9
 
 
@@ -42,11 +42,13 @@ class Coordinates:
     Attributes:
         jaw: the subject's rig.
         pivot: point of the upper scan about which the head rotates [mm], shape (3,).
+        closed_mm: smallest captured opening d1, at most that of the closed bite.
     """
 
     def __init__(self, jaw: JawRig, scans: Sequence[Scan]) -> None:
         """Create coordinates with the pivot at the centre of the upper scan; `scans` are upper and lower scan."""
         self.jaw, self.pivot, self._lower_centre = jaw, scans[0].centre, scans[1].centre
+        self.closed_mm = min(0.0, float(jaw.captured_d[:, 0].min(initial=0.0)))
         self._to_pivot = make_transform(np.eye(3), -self.pivot)
         self._from_pivot = make_transform(np.eye(3), self.pivot)
 
