@@ -22,6 +22,7 @@ _RIGID_TOLERANCE = 1e-6
 
 # maximum magnitude of values [mm, rad]: far beyond any jaw, but small enough that sums of squares do not overflow
 _LARGEST = 1e9
+_GROWTH = ("base_mm", "per_mm")  # names of the coefficients of a landmark's error in the header
 
 
 class HeldOut(NamedTuple):
@@ -103,14 +104,19 @@ class RigArrays:
         return self.arrays["landmarks"]
 
     @property
-    def landmark_sigma_mm(self) -> Array:
-        """Root mean square error of the model at its landmarks [mm], from held-out frames, shape (n,); 0 if unknown."""
+    def error_growth(self) -> Array:
+        """Error of the model at its landmarks, from held-out frames, shape (n, 2); 0 if unknown.
+
+        The columns are the error near captured poses [mm], and its growth with the distance from them [mm/mm].
+        """
         known = self.meta.get("uncertainty")
         if not isinstance(known, dict) or len(self.landmarks) != len(LANDMARKS):
-            return np.zeros(len(self.landmarks))
+            return np.zeros((len(self.landmarks), 2))
         tables = [known.get(name) for name in LANDMARKS]
-        found = [table.get("base_mm", 0.0) if isinstance(table, dict) else 0.0 for table in tables]
-        return np.array([float(x) if isinstance(x, int | float) and 0 < x < _LARGEST else 0.0 for x in found])
+        found = [[table.get(key) if isinstance(table, dict) else None for key in _GROWTH] for table in tables]
+        return np.array(
+            [[float(x) if isinstance(x, int | float) and 0 < x < _LARGEST else 0.0 for x in r] for r in found]
+        )
 
     @property
     def incisor(self) -> Array:

@@ -120,3 +120,15 @@ class RigAuthoring(RigArrays):
         """Return the distance (...) [mm] from d (..., 3) to the d of the nearest captured pose; inf if none."""
         rows, batch = as_rows(d, (3,), "d")
         return in_chunks(lambda d: nearest_distance(self.captured_d, d), rows).reshape(batch)
+
+    def landmark_sigma_mm(self, d: ArrayLike) -> Array:
+        """Return the root mean square error of the model at its landmarks, shape (..., n) [mm]; 0 if unknown.
+
+        It was estimated from held-out frames, and grows with the distance from the captured poses.
+
+        Args:
+            d: Jaw parameters [mm], shape (..., 3).
+        """
+        near_mm, growth = self.error_growth.T
+        distance_mm = self.captured_distance(d)[..., None] if len(self.captured_d) else 0.0
+        return np.asarray(near_mm + growth * distance_mm)

@@ -257,14 +257,15 @@ def covariance_of_points(points: Array, sigma_mm: Array) -> Array:
 
     Args:
         points: Positions of points of a rigid body [mm], shape (n, p, 3).
-        sigma_mm: Root mean square errors of the points, shape (p,); if one is 0, the result is 0.
+        sigma_mm: Root mean square errors of the points, shape (n, p); where one is 0, the result is 0.
     """
-    if not sigma_mm.all():
-        return np.zeros((len(points), 6, 6))
+    known = sigma_mm.all(axis=1)
+    points, found = points[known], np.zeros((len(points), 6, 6))
     J = np.concatenate([-hat(points), np.broadcast_to(np.eye(3), (*points.shape, 3))], axis=-1)
-    precision = np.einsum("npki,npkj,p->nij", J, J, 3.0 / sigma_mm**2)
-    # the factor len / 2 is needed because points of a rigid body do not measure its pose independently
-    return np.asarray(np.linalg.inv(precision) * len(sigma_mm) / 2.0)
+    precision = np.einsum("npki,npkj,np->nij", J, J, 3.0 / sigma_mm[known] ** 2)
+    # the factor p / 2 is needed because points of a rigid body do not measure its pose independently
+    found[known] = np.linalg.inv(precision) * sigma_mm.shape[1] / 2.0
+    return found
 
 
 def whitening_of(covariance: Array) -> Array:

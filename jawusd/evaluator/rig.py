@@ -143,15 +143,15 @@ class JawRig(RigJudging, RigAuthoring):
 
         return in_chunks(derivative, rows).reshape(*batch, *points.shape, 3)
 
-    def pose_covariance(self, T_skull_mandible: ArrayLike) -> Array:
-        """Return the covariance (..., 6, 6) of the rig's own error at poses (..., 4, 4).
+    def pose_covariance(self, d: ArrayLike) -> Array:
+        """Return the covariance (..., 6, 6) of the rig's own error at jaw parameters d (..., 3) [mm].
 
-        The error is xi = (omega [rad], v [mm]) in the skull frame, with ``T_true = exp(xi) T``. Its covariance
+        The error is xi = (omega [rad], v [mm]) in the skull frame, with ``T_true = exp(xi) pose(d)``. Its covariance
         reproduces `landmark_sigma_mm`; it is 0 if the rig does not state these.
         """
-        rows, batch = as_rows(T_skull_mandible, (4, 4), "T_skull_mandible")
-        points = transform_points(rows, self.landmarks[None])
-        return covariance_of_points(points, self.landmark_sigma_mm).reshape(*batch, 6, 6)
+        rows, batch = as_rows(d, (3,), "d")
+        points = transform_points(self.kernels.poses(rows), self.landmarks[None])
+        return covariance_of_points(points, self.landmark_sigma_mm(rows)).reshape(*batch, 6, 6)
 
     def parameter_covariance(self, d: ArrayLike) -> Array:
         """Return the covariance (..., 3, 3) [mm^2] of d (..., 3) [mm] that follows from the rig's own error.
@@ -159,12 +159,12 @@ class JawRig(RigJudging, RigAuthoring):
         It is 0 if the rig does not state its error.
         """
         rows, batch = as_rows(d, (3,), "d")
-        if not self.landmark_sigma_mm.all():
-            return np.zeros((*batch, 3, 3))
-        poses = self.kernels.poses(rows)
-        whitening = whitening_of(self.pose_covariance(poses))
-        none = np.zeros((len(rows), 6, 6))
-        return self._encoder.covariance(rows, poses, whitening, none).reshape(*batch, 3, 3)
+        found, own = np.zeros((len(rows), 3, 3)), self.pose_covariance(rows)
+        known = own.any(axis=(1, 2))
+        none = np.zeros((int(known.sum()), 6, 6))
+        poses = self.kernels.poses(rows[known])
+        found[known] = self._encoder.covariance(rows[known], poses, whitening_of(own[known]), none)
+        return found.reshape(*batch, 3, 3)
 
     @overload
     def encode(self, T_skull_mandible: ArrayLike, *, inside: bool = False, covariance: None = None) -> Encoding: ...
@@ -218,7 +218,7 @@ class JawRig(RigJudging, RigAuthoring):
 
         each = np.arange(len(rows))
         d, residual_mm = pairs_in_chunks(encode, each)
-        own = self.pose_covariance(rows)
+        own = self.pose_covariance(d)
         of_d = in_chunks(lambda i: self._encoder.covariance(d[i], rows[i], whitening[i], own[i]), each)
         return WeightedEncoding(d.reshape(*batch, 3), residual_mm.reshape(batch), of_d.reshape(*batch, 3, 3))
 

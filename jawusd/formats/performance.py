@@ -57,6 +57,8 @@ class Performance:
         covariance: covariance of head twist (in head axes about `pivot`; omega [rad], v [mm]) and of d [mm], shape
             (F, 9, 9).
         rig_covariance: covariance of d that the error of the rig causes [mm^2], shape (F, 3, 3).
+        rig_pose_covariance: covariance of the mandible's pose that the error of the rig causes, twist (omega [rad], v
+            [mm]) in the skull frame, shape (F, 6, 6).
         pivot: reference point of the head twist, upper scan frame [mm], shape (3,).
         state: `SolveState`, shape (F,).
         found: arches whose outlines were used, (upper, lower), shape (F, 2).
@@ -75,6 +77,7 @@ class Performance:
     d: Array
     covariance: Array
     rig_covariance: Array
+    rig_pose_covariance: Array
     pivot: Array
     state: NDArray[np.int8]
     found: Mask

@@ -151,7 +151,7 @@ def test_covariance_of_d_is_that_of_its_errors(rig):
     root = rng.normal(size=(6, 6)) * 0.2 * np.array([[0.004]] * 3 + [[0.3]] * 3) + np.diag([0.004] * 3 + [0.3] * 3)
     covariance, T = root @ root.T, rig.pose(d)
     noise = se3_exp(rng.normal(size=(2000, 6)) @ root.T)
-    own = se3_exp(np.einsum("nij,nj->ni", np.linalg.cholesky(unsure.pose_covariance(T)), rng.normal(size=(2000, 6))))
+    own = se3_exp(np.einsum("nij,nj->ni", np.linalg.cholesky(unsure.pose_covariance(d)), rng.normal(size=(2000, 6))))
     for judge, poses in ((rig, noise @ T), (unsure, noise @ own @ T)):
         found, _, of_d = judge.encode(poses, covariance=covariance)
         lengths = np.einsum("ni,nij,nj->n", found - d, np.linalg.inv(of_d), found - d) / 3.0
@@ -161,19 +161,31 @@ def test_covariance_of_d_is_that_of_its_errors(rig):
 
 
 def test_own_error_of_a_rig_is_that_of_its_landmarks(rig):
-    assert not rig.landmark_sigma_mm.any() and not rig.pose_covariance(rig.T_rest).any()
+    assert not rig.landmark_sigma_mm([10.0, 0.0, 0.0]).any() and not rig.pose_covariance(np.zeros(3)).any()
     assert not rig.parameter_covariance([10.0, 0.0, 0.0]).any()
     table = {name: {"base_mm": 0.3} for name in LANDMARKS}
     unsure = JawRig(rig.arrays, {**rig.meta, "uncertainty": table})
     d = np.array([10.0, 1.0, 0.5])
     points = transform_points(unsure.pose(d), unsure.landmarks)
     J = np.concatenate([-hat(points), np.tile(np.eye(3), (5, 1, 1))], axis=2)
-    spread = np.einsum("pij,jk,pik->p", J, unsure.pose_covariance(unsure.pose(d)), J)
+    spread = np.einsum("pij,jk,pik->p", J, unsure.pose_covariance(d), J)
     assert np.sqrt(spread.mean()) == pytest.approx(0.3, rel=0.35)
-    again = unsure.encode(unsure.pose(d), covariance=unsure.pose_covariance(unsure.pose(d))).covariance
+    again = unsure.encode(unsure.pose(d), covariance=unsure.pose_covariance(d)).covariance
     np.testing.assert_allclose(unsure.parameter_covariance(d), 0.5 * again, rtol=1e-6)  # noise as large as the error
     del table["incisor"]
-    assert not JawRig(rig.arrays, {**rig.meta, "uncertainty": table}).pose_covariance(rig.T_rest).any()
+    assert not JawRig(rig.arrays, {**rig.meta, "uncertainty": table}).pose_covariance(np.zeros(3)).any()
+
+
+def test_error_of_a_rig_grows_with_the_distance_from_captured_poses(rig):
+    """Near captured poses, errors may be 0; they are never 0 away from them."""
+    table = {name: {"base_mm": 0.0, "per_mm": 0.2} for name in LANDMARKS}
+    unsure = JawRig(rig.arrays, {**rig.meta, "uncertainty": table})
+    d = unsure.captured_d[:1] + np.array([[0.0, 0.0, 0.0], [40.0, 0.0, 0.0], [80.0, 0.0, 0.0]])
+    sigma = unsure.landmark_sigma_mm(d)
+    np.testing.assert_allclose(sigma, 0.2 * unsure.captured_distance(d)[:, None] * np.ones(5))
+    assert not unsure.pose_covariance(d[0]).any() and not unsure.parameter_covariance(d[0]).any()
+    variance = np.einsum("nii->n", unsure.parameter_covariance(d))
+    assert variance[0] == 0.0 < variance[1] < variance[2]
 
 
 def test_weighted_encode_with_bounds_stays_inside(rig):

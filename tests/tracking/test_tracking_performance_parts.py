@@ -5,15 +5,26 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import scipy.optimize
 from example_model import LANDMARKS_ANATOMICAL, example_arrays, example_meta
 
 from jawusd.evaluator import JawRig
 from jawusd.formats.performance import Performance, SolveState, write_performance
 from jawusd.formats.poses import read_parameters
 from jawusd.formats.tracks import LOST, load_tracks, save_tracks
-from jawusd.geometry import LANDMARKS, make_transform, relative_pose, se3_exp, se3_inverse, se3_log
+from jawusd.geometry import (
+    LANDMARKS,
+    make_transform,
+    relative_pose,
+    se3_adjoint,
+    se3_exp,
+    se3_inverse,
+    se3_log,
+    transform_point,
+)
 from jawusd.tracking.contour.annotator import DRAWN, AnnotatorPrior
-from jawusd.tracking.performance.coordinates import LOCAL, Coordinates, Pose
+from jawusd.tracking.performance.coordinates import HEAD, JAW, LOCAL, OPENING, Coordinates, Pose
+from jawusd.tracking.performance.instant import CLOSED_MM, bound_equations, rig_gain
 from jawusd.tracking.performance.motion import measured_motion
 from jawusd.tracking.performance.results import tracks_of
 from jawusd.tracking.performance.system import TakeSystem
@@ -138,6 +149,7 @@ def performance(jaw):
         d=d,
         covariance=np.swapaxes(A, 1, 2) @ A,
         rig_covariance=jaw.parameter_covariance(d),
+        rig_pose_covariance=np.zeros((COUNT, 6, 6)),
         pivot=np.array([0.0, 5.0, -9.0]),
         state=np.where(found.all(1), SolveState.SOLVED, SolveState.CARRIED).astype(np.int8),
         found=found,
@@ -171,6 +183,46 @@ def test_covariances_are_those_of_the_moved_poses(jaw, performance):
         np.testing.assert_allclose(
             np.cov(twists.T) / np.outer(scale, scale), covariance / np.outer(scale, scale), atol=0.06
         )
+
+
+@pytest.mark.parametrize("fixed_head", [False, True])
+def test_an_error_of_the_rig_moves_d_as_in_a_least_squares_fit(jaw, fixed_head):
+    """Poses of both arches are measured with given precisions; the lower one deviates from the rig."""
+    rng, scans = (
+        np.random.default_rng(5),
+        (SimpleNamespace(centre=[0.0, 4.0, -9.0]), SimpleNamespace(centre=[0.0, -6.0, -8.0])),
+    )
+    coordinates = Coordinates(jaw, [SimpleNamespace(centre=np.array(scan.centre)) for scan in scans])
+    pose = Pose(se3_exp(rng.normal(size=6) * [0.3, 0.3, 0.3, 9, 9, 9]), np.array([8.0, 1.0, 0.5]))
+    roots = [rng.normal(size=(6, 6)) * np.r_[[9.0] * 3, [1.0] * 3] for _ in range(2)]
+    error = np.r_[rng.normal(size=3) * 1e-5, rng.normal(size=3) * 1e-3]
+    true = np.stack([pose.head, pose.head @ se3_exp(error) @ jaw.pose(pose.d)])
+    about = [se3_adjoint(make_transform(np.eye(3), -transform_point(*at))) for at in zip(coordinates.arches(pose), centres)]
+
+    def residual(step):
+        full = np.r_[np.zeros(6), step] if fixed_head else step
+        moved = coordinates.arches(coordinates.moved(pose, full))
+        twists = [se3_log(one @ se3_inverse(other)) for one, other in zip(moved, true)]
+        return np.concatenate(
+            [root @ se3_adjoint(make_transform(np.eye(3), -c)) @ x for root, c, x in zip(roots, about, twists)]
+        )
+
+    found = scipy.optimize.least_squares(residual, np.zeros(3 if fixed_head else 9), x_scale="jac", xtol=1e-14).x[-3:]
+    slopes = coordinates.slopes(pose)
+    matrix = sum(slope.T @ root.T @ root @ slope for slope, root in zip(slopes, roots))
+    gain = rig_gain(coordinates, pose, matrix, roots[1].T @ roots[1], fixed_head=fixed_head)
+    np.testing.assert_allclose(gain @ error, found, rtol=2e-3, atol=1e-7)
+
+
+def test_teeth_cannot_close_below_the_smallest_captured_opening(jaw):
+    scan = SimpleNamespace(centre=np.array([0.0, 4.0, -9.0]))
+    coordinates = Coordinates(jaw, (scan, scan))
+    assert coordinates.closed_mm <= 0.0
+    d = np.array([coordinates.closed_mm - 1.0, 0.0, 0.0])
+    matrix, right = bound_equations(coordinates, d)
+    step = np.linalg.solve(matrix[JAW, JAW] + 1e-6 * np.eye(3), right[JAW])
+    assert step[0] == pytest.approx(1.0, abs=0.05) and matrix[OPENING, OPENING] > CLOSED_MM**-2.0
+    assert not matrix[HEAD].any()
 
 
 def test_deviations_of_d_include_the_error_of_the_rig(jaw, performance):

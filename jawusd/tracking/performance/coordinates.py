@@ -66,15 +66,22 @@ class Coordinates:
         The twists are about the centres of the crowns, as in `Solution.centres`.
         """
         relative = self.jaw.pose(pose.d)
-        turn = np.zeros((6, 6))
-        turn[:3, :3] = turn[3:, 3:] = pose.head[:3, :3]
+        turn = se3_adjoint(make_transform(pose.head[:3, :3], np.zeros(3)))
         upper, lower = np.zeros((6, LOCAL)), np.zeros((6, LOCAL))
         upper[:, HEAD] = turn
         centre = transform_point(relative, self._lower_centre)
         lower[:, HEAD] = turn @ se3_adjoint(make_transform(np.eye(3), self.pivot - centre))
-        by_d = self.jaw.spatial_jacobian(pose.d)
-        lower[:, JAW] = turn @ se3_adjoint(make_transform(np.eye(3), -centre)) @ by_d
+        lower[:, JAW] = self.error_slope(pose) @ self.jaw.spatial_jacobian(pose.d)
         return upper, lower
+
+    def error_slope(self, pose: Pose) -> Array:
+        """Return the derivative (6, 6) of the lower arch's world twist, as in `slopes`, with respect to a rig error.
+
+        The error is a left twist of the mandible's pose in the skull frame; see `JawRig.pose_covariance`.
+        """
+        centre = transform_point(self.jaw.pose(pose.d), self._lower_centre)
+        turn = make_transform(pose.head[:3, :3], np.zeros(3))
+        return se3_adjoint(turn @ make_transform(np.eye(3), -centre))
 
     def moved(self, pose: Pose, step: Array) -> Pose:
         """Return a pose after a step of the nine unknowns, shape (9,)."""

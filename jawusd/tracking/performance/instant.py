@@ -96,7 +96,12 @@ class InstantSolver:
 
     def equations(self, pose: Pose, state: Solution, outline_weight: Array) -> tuple[Array, Array]:
         """Return normal matrix (9, 9) and right-hand side (9,) of a step, from matched outlines and the rig's bound."""
-        matrix, right = bound_equations(self.coordinates, pose.d)
+        bound, outlines = bound_equations(self.coordinates, pose.d), self.outline_equations(pose, state, outline_weight)
+        return bound[0] + outlines[0], bound[1] + outlines[1]
+
+    def outline_equations(self, pose: Pose, state: Solution, outline_weight: Array) -> tuple[Array, Array]:
+        """Return the part of `equations` from matched outlines."""
+        matrix, right = np.zeros((LOCAL, LOCAL)), np.zeros(LOCAL)
         for r, slope in zip(ARCHES, self.coordinates.slopes(pose), strict=True):
             precision, gradient = state.outline.precision[r].sum(0), state.outline.gradient[r].sum(0)
             matrix += outline_weight[r] * slope.T @ precision @ slope
@@ -110,9 +115,9 @@ class InstantSolver:
 
 
 def bound_equations(coordinates: Coordinates, d: Array) -> tuple[Array, Array]:
-    """Return normal matrix (9, 9) and right-hand side (9,) of quadratic penalties outside the bound, and when too closed.
+    """Return normal matrix (9, 9) and right-hand side (9,) of the penalties for poses outside the bound or too closed.
 
-    Outlines of closed teeth fit nearly as well with the lower teeth some millimetres too high, inside the upper ones.
+    Both are quadratic. Outlines of closed teeth fit nearly as well with the lower teeth some millimetres higher, inside the upper teeth.
     """
     matrix, right = np.zeros((LOCAL, LOCAL)), np.zeros(LOCAL)
     margin = float(coordinates.jaw.margin(d))
@@ -125,6 +130,23 @@ def bound_equations(coordinates: Coordinates, d: Array) -> tuple[Array, Array]:
         matrix[OPENING, OPENING] += CLOSED_MM**-2.0
         right[OPENING] += below_mm / CLOSED_MM**2
     return matrix, right
+
+
+def rig_gain(coordinates: Coordinates, pose: Pose, matrix: Array, lower: Array, *, fixed_head: bool = False) -> Array:
+    """Return the derivative (3, 6) of the estimated d with respect to an error of the rig, from one frame.
+
+    Where the outlines determine d poorly, an error of the rig is amplified: the head and d move until the outlines fit.
+
+    Args:
+        pose: estimated pose.
+        matrix: normal matrix of the frame, positive definite, shape (9, 9).
+        lower: precision of the lower arch's twist, as in `Solution`, shape (6, 6).
+        fixed_head: whether the head is known.
+    """
+    free = JAW if fixed_head else slice(0, LOCAL)
+    slope = coordinates.slopes(pose)[1][:, free]
+    gain = np.linalg.solve(matrix[free, free], slope.T @ lower @ coordinates.error_slope(pose))
+    return np.asarray(gain[-3:], np.float64)
 
 
 def quick(solver: ContourSolver) -> ContourSolver:

@@ -42,7 +42,7 @@ def performance_of(
     fits = smoothed.fits
     d = np.stack([fit.pose.d for fit in fits])
     verdicts = jaw.validate_parameters(d, tolerance_mm=None)
-    found = np.stack([fit.found for fit in fits])
+    of_rig, found = jaw.pose_covariance(d), np.stack([fit.found for fit in fits])
     missed = np.stack([fit.missed for fit in fits]).any(1)
     unseen = np.where(missed, SolveState.LOST, SolveState.CARRIED)
     state = np.where(found.all(1), SolveState.SOLVED, np.where(smoothed.by_skin, SolveState.SKIN, unseen))
@@ -57,7 +57,8 @@ def performance_of(
         T_world_upper=np.stack([fit.pose.head for fit in fits]),
         d=d,
         covariance=smoothed.covariance,
-        rig_covariance=jaw.parameter_covariance(d),
+        rig_covariance=_spread(smoothed.rig_gain, of_rig),
+        rig_pose_covariance=_spread(jaw.spatial_jacobian(d) @ smoothed.rig_gain - np.eye(6), of_rig),
         pivot=pivot,
         state=state.astype(np.int8),
         found=found,
@@ -89,8 +90,7 @@ def tracks_of(performance: Performance, jaw: JawRig) -> Tracks:
     of_upper, of_lower = np.zeros((2, len(p.frames), 6, 9))
     of_upper[..., HEAD] = of_lower[..., HEAD] = turn
     of_lower[..., JAW] = se3_adjoint(head) @ by_d
-    relative_covariance = _spread(by_d, p.covariance[:, JAW, JAW])
-    own = landmark_sigmas(relative, relative_covariance, jaw.landmarks)
+    relative_covariance = _spread(by_d, p.covariance[:, JAW, JAW]) + p.rig_pose_covariance
     meta = TracksMeta(solver="performance", tolerance_mm=jaw.tolerance_mm)
     meta.update(_known_notes(p))
     moved = jaw.meta.get("registration")
@@ -117,8 +117,8 @@ def tracks_of(performance: Performance, jaw: JawRig) -> Tracks:
         masks_used=p.use,
         covariance_upper=_spread(of_upper, p.covariance),
         covariance_lower=_spread(of_lower, p.covariance),
-        covariance_relative=relative_covariance + jaw.pose_covariance(relative),
-        sigma_mm=np.hypot(own, jaw.landmark_sigma_mm),
+        covariance_relative=relative_covariance,
+        sigma_mm=landmark_sigmas(relative, relative_covariance, jaw.landmarks),
         residual_px=p.residual_px,
         matched_px=p.matched_px,
         camera_names=p.camera_names,

@@ -16,7 +16,7 @@ from jawusd.tracking.contour.scan import ARCHES
 from jawusd.tracking.contour.solver import Matched
 from jawusd.tracking.performance.attempts import LARGEST_SIGMA, Attempts, FrameFit, usual_residual_px
 from jawusd.tracking.performance.coordinates import HEAD, JAW, LOCAL, Coordinates
-from jawusd.tracking.performance.instant import InstantSolver
+from jawusd.tracking.performance.instant import InstantSolver, rig_gain
 from jawusd.tracking.performance.motion import Motion, head_bends, measured_motion
 from jawusd.tracking.performance.skin import SLOW, SkinFactor
 from jawusd.tracking.performance.system import TakeSystem
@@ -43,6 +43,7 @@ class Smoothed:
     state: TakeState
     sigma_log_focal: Array  # standard deviations of the log focal lengths, shape (C,)
     by_skin: Mask  # frames in which skin contributed to d, shape (F,)
+    rig_gain: Array  # derivatives of d with respect to an error of the rig, shape (F, 3, 6); see `rig_gain`
 
 
 class Smoother:
@@ -133,7 +134,19 @@ class Smoother:
         covariance, shared = self._covariance(self._system(fits, state, weight, motion, slow, bounded=False))
         if self._unknowns.free_focal:
             sigma = np.sqrt(self._wider * np.diag(shared)[self._unknowns.focal])
-        return Smoothed(fits, covariance, state, sigma, self._by_skin(len(fits)))
+        gains = np.stack([self._rig_gain(fit, weight) for fit in fits])
+        return Smoothed(fits, covariance, state, sigma, self._by_skin(len(fits)), gains)
+
+    def _rig_gain(self, fit: FrameFit, weight: Array) -> Array:
+        """Return the derivative (3, 6) of d with respect to an error of the rig; 0 where d is not from outlines."""
+        if fit.solution is None or not fit.found[1]:
+            return np.zeros((3, 6))
+        matrix = (
+            np.diag(LARGEST_SIGMA**-2.0)
+            + self._instants.outline_equations(fit.pose, fit.solution, weight * fit.found)[0]
+        )
+        lower = weight[1] * fit.solution.outline.precision[1].sum(0)
+        return rig_gain(self._coordinates, fit.pose, matrix, lower, fixed_head=self._unknowns.fixed_head)
 
     def _by_skin(self, count: int) -> Mask:
         return np.zeros(count, bool) if self._skin is None else self._skin.used

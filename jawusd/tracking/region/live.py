@@ -13,11 +13,11 @@ from jawusd.evaluator import JawRig
 from jawusd.geometry import Camera
 from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.contour.quality import residual_px
-from jawusd.tracking.contour.scan import ARCHES, Scan, thinned
+from jawusd.tracking.contour.scan import Scan, thinned
 from jawusd.tracking.contour.solver import ContourSolver
 from jawusd.tracking.performance.attempts import FrameFit
 from jawusd.tracking.performance.coordinates import JAW, Coordinates, Pose
-from jawusd.tracking.performance.instant import InstantSolver
+from jawusd.tracking.performance.instant import InstantSolver, rig_gain
 from jawusd.tracking.performance.motion import STEADY
 from jawusd.tracking.region.appearance import CORRELATION_PX, Cut, LearnedColours
 from jawusd.tracking.region.effort import FAST
@@ -86,11 +86,12 @@ class LiveTake:
         """
         if self._tracker is None:
             raise ValueError("the standard deviations were requested before `begin` was called")
-        precision = np.diag(self._tracker.expected.precision)
+        precision, of_rig = np.diag(self._tracker.expected.precision), np.zeros((3, 3))
         if fit.solution is not None and fit.found.any():
-            variance = np.where(fit.found, residual_px(fit.solution) ** 2 * CORRELATION_PX, np.inf)
-            for r, slope in zip(ARCHES, self.coordinates.slopes(fit.pose), strict=True):
-                precision += slope.T @ fit.solution.outline.precision[r].sum(0) @ slope / variance[r]
+            weight = np.where(fit.found, 1.0 / (residual_px(fit.solution) ** 2 * CORRELATION_PX), 0.0)
+            precision = precision + self._instants.outline_equations(fit.pose, fit.solution, weight)[0]
+            lower = weight[1] * fit.solution.outline.precision[1].sum(0)
+            gain = rig_gain(self.coordinates, fit.pose, precision, lower)
+            of_rig = gain @ self.coordinates.jaw.pose_covariance(fit.pose.d) @ gain.T
         variance_mm2 = _WIDER**2 * np.diag(np.linalg.inv(precision))[JAW]
-        of_rig = self.coordinates.jaw.parameter_covariance(fit.pose.d)
         return np.asarray(np.sqrt(variance_mm2 + np.diag(of_rig)), np.float64)
