@@ -197,7 +197,8 @@ def test_an_error_of_the_rig_moves_d_as_in_a_least_squares_fit(jaw, fixed_head):
     roots = [rng.normal(size=(6, 6)) * np.r_[[9.0] * 3, [1.0] * 3] for _ in range(2)]
     error = np.r_[rng.normal(size=3) * 1e-5, rng.normal(size=3) * 1e-3]
     true = np.stack([pose.head, pose.head @ se3_exp(error) @ jaw.pose(pose.d)])
-    about = [se3_adjoint(make_transform(np.eye(3), -transform_point(*at))) for at in zip(coordinates.arches(pose), centres)]
+    places = [transform_point(T, centre) for T, centre in zip(coordinates.arches(pose), centres)]
+    about = [se3_adjoint(make_transform(np.eye(3), -place)) for place in places]
 
     def residual(step):
         full = np.r_[np.zeros(6), step] if fixed_head else step
