@@ -188,11 +188,8 @@ def test_covariances_are_those_of_the_moved_poses(jaw, performance):
 @pytest.mark.parametrize("fixed_head", [False, True])
 def test_an_error_of_the_rig_moves_d_as_in_a_least_squares_fit(jaw, fixed_head):
     """Poses of both arches are measured with given precisions; the lower one deviates from the rig."""
-    rng, scans = (
-        np.random.default_rng(5),
-        (SimpleNamespace(centre=[0.0, 4.0, -9.0]), SimpleNamespace(centre=[0.0, -6.0, -8.0])),
-    )
-    coordinates = Coordinates(jaw, [SimpleNamespace(centre=np.array(scan.centre)) for scan in scans])
+    rng, centres = np.random.default_rng(5), np.array([[0.0, 4.0, -9.0], [0.0, -6.0, -8.0]])
+    coordinates = Coordinates(jaw, [SimpleNamespace(centre=centre) for centre in centres])
     pose = Pose(se3_exp(rng.normal(size=6) * [0.3, 0.3, 0.3, 9, 9, 9]), np.array([8.0, 1.0, 0.5]))
     roots = [rng.normal(size=(6, 6)) * np.r_[[9.0] * 3, [1.0] * 3] for _ in range(2)]
     error = np.r_[rng.normal(size=3) * 1e-5, rng.normal(size=3) * 1e-3]
@@ -204,9 +201,7 @@ def test_an_error_of_the_rig_moves_d_as_in_a_least_squares_fit(jaw, fixed_head):
         full = np.r_[np.zeros(6), step] if fixed_head else step
         moved = coordinates.arches(coordinates.moved(pose, full))
         twists = [se3_log(one @ se3_inverse(other)) for one, other in zip(moved, true)]
-        return np.concatenate(
-            [root @ se3_adjoint(make_transform(np.eye(3), -c)) @ x for root, c, x in zip(roots, about, twists)]
-        )
+        return np.concatenate([root @ move @ twist for root, move, twist in zip(roots, about, twists)])
 
     found = scipy.optimize.least_squares(residual, np.zeros(3 if fixed_head else 9), x_scale="jac", xtol=1e-14).x[-3:]
     slopes = coordinates.slopes(pose)

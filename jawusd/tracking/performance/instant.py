@@ -117,7 +117,7 @@ class InstantSolver:
 def bound_equations(coordinates: Coordinates, d: Array) -> tuple[Array, Array]:
     """Return normal matrix (9, 9) and right-hand side (9,) of the penalties for poses outside the bound or too closed.
 
-    Both are quadratic. Outlines of closed teeth fit nearly as well with the lower teeth some millimetres higher, inside the upper teeth.
+    Outlines of closed teeth fit nearly as well with the lower teeth some millimetres higher, inside the upper teeth.
     """
     matrix, right = np.zeros((LOCAL, LOCAL)), np.zeros(LOCAL)
     margin = float(coordinates.jaw.margin(d))
