@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     from jawusd.tracking.config import Mapper
     from jawusd.tracking.contour.scan import Scan
     from jawusd.tracking.contour.views import View
+    from jawusd.tracking.follow import Begin
     from jawusd.tracking.region.appearance import Cut, Picture
-    from jawusd.tracking.region.recovery import Begin
     from jawusd.tracking.region.tracker import RegionPose, RegionTracker
 
 
@@ -123,7 +123,7 @@ class Follower:
             CaptureError: an image cannot be decoded.
         """
         from jawusd.tracking.contour.scan import teeth_centre
-        from jawusd.tracking.region.recovery import Begin
+        from jawusd.tracking.follow import Begin
         from jawusd.tracking.region.tracker import RegionTracker
 
         cutter = Cutter(self.cameras, self._scans, teeth_centre(self._scans, poses), self._pool)
@@ -142,7 +142,7 @@ class Follower:
         Raises:
             CaptureError: an image cannot be decoded.
         """
-        from jawusd.tracking.region.recovery import TwoWays
+        from jawusd.tracking.follow import TwoWays
 
         points, up = self._subject.landmarks[:3], self._subject.T_anatomical_skull[1, :3]
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -40,6 +40,7 @@ class FrameFit:
         uncovered: fraction of every mask that is not covered by the scan, NaN without a mask, shape (2, C).
         growth: derivatives of the outlines with respect to unknown focal lengths.
         uncertain: whether less of the contour fits than usual, so that the pose may be wrong.
+        objective_px: score that ranks poses of this frame [px]; see `Trial.objective`.
     """
 
     pose: Pose
@@ -49,6 +50,7 @@ class FrameFit:
     uncovered: Array
     growth: Growth | None = None
     uncertain: bool = False
+    objective_px: float = 0.0
 
     @property
     def found(self) -> Mask:
@@ -158,7 +160,8 @@ class Attempts:
     def judged(self, trial: Trial, instant: Instant) -> FrameFit:
         """Return the attempt as a frame fit, excluding arches that do not fit their masks."""
         use = trial.use & ~self.bad(trial)[:, None]
-        return FrameFit(trial.pose, trial.solution, use, instant.present, trial.uncovered)
+        objective_px = replace(trial, use=use).objective(self.config.uncovered_price)
+        return FrameFit(trial.pose, trial.solution, use, instant.present, trial.uncovered, objective_px=objective_px)
 
 
 def empty_fit(pose: Pose, instant: Instant) -> FrameFit:

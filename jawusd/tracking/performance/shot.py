@@ -1,28 +1,30 @@
-"""The solve of a shot: start pose, first pass in both directions, backward pass into gaps, and joint refinement."""
+"""The solve of a shot: start pose, first pass in both directions, and joint refinement."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
 
+from jawusd.base.arrays import Array
 from jawusd.base.errors import TrackingError
 from jawusd.evaluator import JawRig
 from jawusd.formats.capture import Capture
 from jawusd.formats.finding import Finding
 from jawusd.formats.mesh import Mesh
 from jawusd.formats.performance import Performance
-from jawusd.geometry import Camera
+from jawusd.geometry import Camera, transform_points
 from jawusd.tracking.config import Mapper, TrackingConfig
 from jawusd.tracking.contour.scan import Scan, prepare_scan, teeth_centre
 from jawusd.tracking.contour.solver import ContourSolver
 from jawusd.tracking.contour.views import MaskViews, masked_sources
+from jawusd.tracking.follow import Begin, TwoWays
 from jawusd.tracking.initialization.footage import Footage
 from jawusd.tracking.initialization.scan_checks import check_occlusion
 from jawusd.tracking.initialization.start import find_start
-from jawusd.tracking.performance.attempts import Attempts, FrameFit, usual_residual_px
+from jawusd.tracking.performance.attempts import Attempts, FrameFit
 from jawusd.tracking.performance.coordinates import Coordinates, Pose
 from jawusd.tracking.performance.forward import ForwardPass
 from jawusd.tracking.performance.instant import InstantSolver, quick, whole
@@ -104,12 +106,12 @@ class _Take:
         self._jaw, self._config, self._shot, self._progress = jaw, solver.config, shot, progress
         self.coordinates = Coordinates(jaw, solver.scans)
         self._quick, self._full = (InstantSolver(one, self.coordinates) for one in (quick(solver), whole(solver)))
-        self._views = KeptViews(shot.views)
+        self._views, self._probes = KeptViews(shot.views), solver.scans[1].probes
         self._weight = np.full(2, 1.0 / self._config.typical_noise_px3)
         self.fits: dict[int, FrameFit] = {}
 
     def first_pass(self) -> None:
-        """Align every frame from the start in both directions, then backwards into gaps."""
+        """Align every frame from the start in both directions, and back from frames by which others can be judged."""
         first, stop = self._shot.frames
         start = self._shot.start_frame
         attempts = Attempts(self._quick, self._weight)
@@ -120,30 +122,18 @@ class _Take:
                 frame=start,
                 hint="Check that the rig is of this subject, and check the masks and calibration at this frame.",
             )
-        self.fits[start] = begun
-        for frames in (range(start + 1, stop), range(start - 1, first - 1, -1)):
-            passing = ForwardPass(Attempts(self._quick, self._weight), begun, fixed_head=self._shot.fixed_head)
-            for frame in frames:
-                self.fits[frame] = passing.step(self._views.at(frame))
-                self._progress(len(self.fits), stop - first)
-        self._close_gaps()
+        take = TwoWays(range(first, stop), self._places, lambda fit: fit.objective_px, progress=self._progress)
+        take.follow(Begin(start, begun, self._walk))
+        self.fits = take.known
 
-    def _close_gaps(self) -> None:
-        """Align backwards into each run of frames in which an arch was missed, from the frame after the run."""
-        usual = usual_residual_px(self.fits.values())
-        after: ForwardPass | None = None
-        for frame in sorted(self.fits, reverse=True):
-            fit = self.fits[frame]
-            if not fit.missed.any():
-                after = None
-                continue
-            if after is None and frame + 1 in self.fits and self.fits[frame + 1].found.all():
-                attempts = Attempts(self._quick, self._weight, usual)
-                after = ForwardPass(attempts, self.fits[frame + 1], fixed_head=self._shot.fixed_head)
-            if after is not None:
-                again = after.step(self._views.at(frame))
-                if again.found.sum() > fit.found.sum():
-                    self.fits[frame] = again
+    def _walk(self, way: range, near: FrameFit) -> Iterator[FrameFit]:
+        """Yield the fits of frames in tracking order, next to a given fit."""
+        passing = ForwardPass(Attempts(self._quick, self._weight), near, fixed_head=self._shot.fixed_head)
+        for frame in way:
+            yield passing.step(self._views.at(frame))
+
+    def _places(self, fit: FrameFit) -> Array:
+        return transform_points(self._jaw.pose(fit.pose.d), self._probes)
 
     def second_pass(self) -> Smoothed:
         """Refine all frames jointly."""

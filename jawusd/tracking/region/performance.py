@@ -17,6 +17,7 @@ from jawusd.tracking.contour.annotator import AnnotatorPrior
 from jawusd.tracking.contour.quality import score_px
 from jawusd.tracking.contour.scan import Scan, teeth_centre, thinned
 from jawusd.tracking.contour.solver import ContourSolver
+from jawusd.tracking.follow import Begin, TwoWays
 from jawusd.tracking.performance.attempts import FrameFit
 from jawusd.tracking.performance.coordinates import Coordinates, Pose
 from jawusd.tracking.performance.instant import InstantSolver
@@ -25,7 +26,6 @@ from jawusd.tracking.performance.results import performance_of
 from jawusd.tracking.performance.skin import SkinOf, jaw_of_skin
 from jawusd.tracking.performance.smoother import WIDER, Smoothed, Smoother, with_one_head
 from jawusd.tracking.region.appearance import Cut, LearnedColours
-from jawusd.tracking.region.recovery import Begin, TwoWays
 from jawusd.tracking.region.rig_tracker import RigTracker
 from jawusd.tracking.region.search import fitting_share
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jawusd.base.errors import TrackingError
-from jawusd.tracking.region.recovery import Begin, TwoWays, lost_stretches, nearest_found
+from jawusd.tracking.follow import Begin, TwoWays, lost_stretches, nearest_found
 
 FRAMES = range(10, 30)
 
