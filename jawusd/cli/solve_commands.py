@@ -178,9 +178,7 @@ def live(
     ] = None,
     osc: Annotated[str | None, typer.Option(metavar="HOST:PORT", help="OSC messages: /jaw/d, /jaw/sigma, ...")] = None,
     view: Annotated[bool, typer.Option("--view", help="Also show the jaw in a page on this machine.")] = False,
-    port: Annotated[
-        int, typer.Option(min=0, max=65535, help="Port of the page; if it is in use, the next free port.")
-    ] = 8080,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="Port of the page, or the next free port.")] = 8080,
     head: Annotated[Head, typer.Option(help="fixed: the cameras are head-mounted.")] = Head.free,
     seconds: Annotated[
         float | None, typer.Option(min=0.1, help="Stop after this time [s].", show_default=False)
