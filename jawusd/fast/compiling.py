@@ -12,7 +12,7 @@ import numba
 F = TypeVar("F")
 
 _in_memory = partial(numba.njit, nogil=True, error_model="numpy")
-_cacheable: list[bool] = []  # empty until the first function is compiled
+_cacheable: list[bool] = []  # whether machine code can be cached on disk; empty until the first function is compiled
 
 
 def compiled(signature: str) -> Callable[[F], F]:
@@ -25,7 +25,7 @@ def compiled(signature: str) -> Callable[[F], F]:
         if not _cacheable or _cacheable[0]:
             try:
                 made = cast("F", _in_memory(signature, cache=True)(function))
-            except (OSError, RuntimeError) as error:  # there is no writable folder, or the disk is full
+            except (OSError, RuntimeError) as error:  # no cache folder is writable, or the disk is full
                 _cacheable[:] = [False]
                 _warn(error)
             else:

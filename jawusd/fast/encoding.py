@@ -1,7 +1,7 @@
-"""Compiled encoding of single poses, by the damped Gauss-Newton of `jawusd.evaluator.solver`, and verdicts.
+"""Compiled encoding and verdicts for single poses; encoding uses damped Gauss-Newton as in `jawusd.evaluator.solver`.
 
-All functions take one row. A `Problem` consists of the chart of the unknowns x [mm], homogeneous vectors (4, m), and
-their targets (3, m) [mm].
+Every function handles one pose. A `Problem` consists of the chart of the unknowns x [mm], homogeneous vectors (4, m),
+and their targets (3, m) [mm].
 """
 
 from __future__ import annotations
@@ -127,7 +127,7 @@ def _velocity(S: Array, k: int, y0: float, y1: float, y2: float, h: float) -> Ve
 
 @device
 def descend(model: Array, problem: Problem, x: Array, w: Scratch, n: Normal) -> None:
-    """Move x (3,) to the minimum; set it to NaN if the residual at the start is not finite."""
+    """Move x (3,) to the minimum of the squared residual; set x to NaN if the residual at the start is not finite."""
     cost = equations(model, problem, x, w, n.A, n.g)
     if not isfinite(cost):
         x[:] = np.nan

@@ -1,4 +1,4 @@
-"""Compiled slice hull of `jawusd.evaluator.bounds`, for one row.
+"""Compiled slice hull of `jawusd.evaluator.bounds`, for a single row of a batch.
 
 `bound` is the array from `packing.packed_bound`, `v` the scratch memory from `hull_scratch`.
 """
@@ -13,7 +13,8 @@ from jawusd.base.arrays import Array
 from jawusd.fast.packing import HULL, MARGIN, ROUNDING, SIDES
 from jawusd.fast.rigid import Vector, device, interval
 
-_NEGLIGIBLE = 45.0  # exponent below which terms relative to the largest are skipped: exp(-45) = 3e-20 is below rounding
+# Exponent, relative to the largest, below which a term is skipped: exp(-45) = 3e-20 is below rounding.
+_NEGLIGIBLE = 45.0
 
 
 @device

@@ -25,7 +25,7 @@ from jawusd.fast.rigid import device
 
 @device
 def usable(d1: float, d2: float, d3: float) -> bool:
-    """Return whether d is finite and below `LARGEST`; other rows give NaN."""
+    """Return whether d is finite and below `LARGEST`; the results for other rows are NaN."""
     return abs(d1) < LARGEST and abs(d2) < LARGEST and abs(d3) < LARGEST
 
 

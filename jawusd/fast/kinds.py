@@ -1,4 +1,4 @@
-"""The compiled form of each kind of model: its part of the packed model, its motion and derivatives, for one row.
+"""The compiled form of each kind of model: its part of the packed model, its motion and derivatives, for one d.
 
 See `jawusd.evaluator.models`. `model` is the array from `motion.packed_model`, `w` the scratch memory of one call.
 """
@@ -234,7 +234,7 @@ def scratch(model: Array) -> Scratch:
 
 @device
 def motion(model: Array, d1: float, d2: float, d3: float, w: Scratch) -> bool:
-    """Write M(d) to w.M and its rotation vector to w.twist; return whether w.twist is all of log M."""
+    """Write M(d) to w.M and its rotation vector to w.twist; return whether w.twist is the complete log M."""
     if model[KIND] == _ADDITIVE:
         summed_curves(model, d1, d2, d3, w.twist, w.twist_d)
         move(w.twist, w.M)
@@ -245,14 +245,14 @@ def motion(model: Array, d1: float, d2: float, d3: float, w: Scratch) -> bool:
 
 @device
 def displaced(model: Array, u: Vector, w: Scratch) -> None:
-    """Write the motion of an anchored model that displaces the incisal point by u, and its rotation vector."""
+    """Write the motion, and its rotation vector, of an anchored model for the incisal displacement u."""
     w.twist[0], w.twist[1], w.twist[2] = spline(model, u, w.centres)
     _anchor(model, u, w)
 
 
 @device
 def _anchor(model: Array, u: Vector, w: Scratch) -> None:
-    """Write the motion that rotates by w.twist[:3] and displaces the incisal point by u to w.M."""
+    """Write to w.M the motion that rotates by w.twist[:3] and displaces the incisal point by u."""
     rotate((w.twist[0], w.twist[1], w.twist[2]), w.M)
     p = (model[INCISOR], model[INCISOR + 1], model[INCISOR + 2])
     for i in range(3):
@@ -261,7 +261,7 @@ def _anchor(model: Array, u: Vector, w: Scratch) -> None:
 
 @device
 def motion_by_displacement(model: Array, u0: float, u1: float, u2: float, w: Scratch) -> None:
-    """Write the motion of an anchored model that displaces the incisal point by u to w.M, and its S to w.S."""
+    """Write an anchored model's motion for the incisal displacement u to w.M, and its spatial derivative S to w.S."""
     omega = spline_derivative(model, (u0, u1, u2), w.centres, w.omega_u)
     w.twist[0], w.twist[1], w.twist[2] = omega
     _anchor(model, (u0, u1, u2), w)
@@ -277,7 +277,7 @@ def motion_by_displacement(model: Array, u0: float, u1: float, u2: float, w: Scr
 
 @device
 def motion_derivative(model: Array, d1: float, d2: float, d3: float, w: Scratch) -> bool:
-    """Write M(d) and its spatial derivative to w.M and w.S; return whether w.twist_d is d log M / dd."""
+    """Write M(d) to w.M and its spatial derivative to w.S; return whether w.twist_d is d log M / dd."""
     if model[KIND] == _ADDITIVE:
         summed_curves(model, d1, d2, d3, w.twist, w.twist_d)
         move(w.twist, w.M)

@@ -1,4 +1,4 @@
-"""Compiled jaw model of any kind, for one row: packed model, twists, their derivatives, and poses.
+"""Compiled jaw model of any kind, for one d: packed model, twists, their derivatives, and poses.
 
 `model` is the array from `packed_model`, `w` the scratch memory of one call; see `jawusd.fast.kinds`.
 """

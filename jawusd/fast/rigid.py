@@ -1,4 +1,4 @@
-"""Compiled rotations, rigid motions and small linear algebra, for one row."""
+"""Compiled rotations, rigid motions and small linear algebra, one item at a time."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from jawusd.geometry.rodrigues import angle_coefficients, apply_series, dot, tur
 
 Vector = tuple[float, float, float]
 
-# device functions are not cached themselves: they are inlined into those of `kernels`, which are cached on disk
+# device functions are not cached themselves: they are inlined into the functions of `kernels`, which are cached on disk
 device = numba.njit(nogil=True, error_model="numpy")
 # like `device`, but sums may be reassociated
 summing = numba.njit(nogil=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"})
 
-# Plain functions of other modules that compiled code calls. Without inlining, the functions in an `Elementary` would be
-# addresses in the machine code, which could then not be cached on disk.
+# Plain functions from other modules, called by compiled code. Without inlining, the functions in an `Elementary` would
+# be addresses in the machine code, which could then not be cached on disk.
 for _function in (
     *(rodrigues.angle_series, rodrigues.angle_quotients, rodrigues.angle_coefficients, rodrigues.cross, rodrigues.dot),
     *(rodrigues.apply_series, rodrigues.turning, gauge.path, gauge.arch, gauge.drop),
@@ -76,7 +76,7 @@ def _glide(table: Array, d2: float, d3: float) -> Vector:
     s, t = d2 - side[count2 + i], d3 - front[count3 + j]
     c = table[4 + 2 * count2 + 2 * count3 + 16 * (i * (count3 + 1) + j) :]
     down = down_2 = down_3 = 0.0
-    for k in range(3, -1, -1):  # from the highest power of d3 to the lowest
+    for k in range(3, -1, -1):  # Horner's scheme, from the highest power of d3 to the lowest
         a = ((c[12 + k] * s + c[8 + k]) * s + c[4 + k]) * s + c[k]
         b = (3.0 * c[12 + k] * s + 2.0 * c[8 + k]) * s + c[4 + k]
         down_3 = down_3 * t + down

@@ -16,10 +16,10 @@ PRINCIPAL = "principal component 1"
 
 _STEPS = 121
 _SHOWN_OPENINGS = (0.0, 1 / 3, 2 / 3, 1.0)  # fractions of a path at which the outline of the condyle is drawn
-_AROUND_MM = 24.0  # radius around the condyle's centre within which bone is drawn
+_AROUND_MM = 24.0  # radius [mm] around the condyle's centre within which bone is drawn
 _NEAR_CLOSED_MM = 5.0
-_HABITUAL_MM = 1.5  # maximum |d2| and |d3| of captured poses that count as pure opening
-_BESIDE_MM = 0.75  # maximum difference in z of the captured condyles that limit the height of a path point
+_HABITUAL_MM = 1.5  # maximum |d2| and |d3| [mm] of captured poses that count as pure opening
+_BESIDE_MM = 0.75  # maximum difference in z [mm] between a path point and the captured condyles that limit its height
 _FEWEST_BESIDE = 3
 
 
@@ -44,7 +44,7 @@ def condyle_paths(
 
 
 def parameter_paths(data: TrainingData, models: dict[str, JawModelForm], captured: Array) -> tuple[ParameterPath, ...]:
-    """Sweep each parameter of each model alone, from the closed bite over the parameter's captured range.
+    """Sweep the parameters of each model one at a time, from the closed bite over the captured range.
 
     Args:
         captured: parameters of the captured poses in the default model [mm], shape (N, 3).
@@ -105,7 +105,7 @@ def sagittal_section(mesh: Mesh, centre: Array, around_mm: float) -> Array:
         return np.empty((0, 2, 2))
     height = cut[:, :, 0] - centre[0]
     above = height > 0
-    # One of the three corners of a face is alone on its side of the plane; the cut connects points on this corner's
+    # One of the three corners of a cut face is alone on its side of the plane; the cut connects points on this corner's
     # edges.
     alone = np.where(above.sum(1) == 1, above.argmax(1), (~above).argmax(1))
     rows = np.arange(len(cut))

@@ -20,8 +20,8 @@ from jawusd.meshes.meshio import winding
 from jawusd.meshes.raster import Bits, Singles, count_and_not, draw_silhouette, pack_bits, project
 from jawusd.tracking.contour.views import View
 
-_MARGIN_PX = 48  # margin of the screen buffer around the initial scan; 7 mm, more than any search moves it
-_FARTHEST_PX = 1024  # maximum extent of the screen buffer beyond the masks
+_MARGIN_PX = 48  # margin [px] of the screen buffer around the initial scan: 7 mm, more than any search moves the scan
+_FARTHEST_PX = 1024  # maximum extent [px] of the screen buffer beyond the masks
 
 _MATRICES = types.Array(types.float32, 3, "C", readonly=True)
 _SCREENS = types.Array(types.uint64, 3, "C", readonly=True)
@@ -170,7 +170,7 @@ def _count(
     width: int,
     counts: NDArray[np.int64],
 ) -> None:
-    """Write the counts (T, 2) of the T renderings from number `first`; numbers run pose by pose, then by view."""
+    """Write the counts (T, 2) of T renderings, starting at index `first`; all views of a pose are consecutive."""
     points = np.empty((vertices.shape[0], 3), np.float32)
     bits = np.empty((masks.shape[1], masks.shape[2]), np.uint64)
     for t in range(counts.shape[0]):
@@ -269,7 +269,7 @@ def checked_screens(matrices: Array, masks: Mask, free: Mask) -> None:
     views = len(matrices)
     if np.shape(matrices) != (views, 3, 4) or np.ndim(masks) != 3 or len(masks) != views or 0 in np.shape(masks):
         raise ValueError(
-            f"matrices and masks need shapes (C, 3, 4) and (C, h, w), got {np.shape(matrices)} and {np.shape(masks)}"
+            f"matrices and masks must be (C, 3, 4) and (C, h, w), got {np.shape(matrices)} and {np.shape(masks)}"
         )
     if np.shape(free) != np.shape(masks):
         raise ValueError(f"free has shape {np.shape(free)}, but masks has shape {np.shape(masks)}")

@@ -168,7 +168,7 @@ def _networks(
 
 
 def _reconstruction(data: TrainingData, fitted: _Fitted, nets: list[Nlpca]) -> list[Distances]:
-    """Return the errors of paper Fig. 12: reconstruction of all captured poses, also trimmed ones, by each model."""
+    """Return the errors of paper Fig. 12: reconstruction of all captured poses, trimmed ones included, by model."""
     root = data.metric.twist_root()
     points = se3_log(data.motion) @ root
     rebuilt = {

@@ -32,9 +32,9 @@ FIGURES = ("fig5_condyle_path", "fig12_reconstruction", "fig13_synthesis", "cove
 _HEADS = (PALE, SKY, BLUE, BLACK)  # colours of the condyle outlines, from closed to wide open
 _BINS = 40
 _SCALE_QUANTILE = 0.8  # quantile of the models' 95 % quantiles at which the shared axis of the histograms ends
-_BONES_MM, _CLOSE_MM = 12.0, 1.5  # margins around the paths, in the row with bones and in the enlarged row
+_BONES_MM, _CLOSE_MM = 12.0, 1.5  # margins [mm] around the paths in the row with bones and in the enlarged row
 _ADVICE_LETTERS = 140  # maximum number of characters per line of advice above the coverage plot
-_FEW_MM = 1.0  # minimum range of the shared axis of the histograms
+_FEW_MM = 1.0  # minimum range [mm] of the shared axis of the histograms
 _MANY = 2500  # maximum number of points drawn as vectors; more are rasterised to limit the file size
 _MOVES = ("opening d1", "laterotrusion d2", "protrusion d3")
 
@@ -181,7 +181,7 @@ def _histograms(
     columns = min(columns, len(samples))
     rows = -(-len(samples) // columns)
     figure, axes = new_figure(11.0, 1.9 * rows + 0.6, rows, columns, sharex=True, sharey=True)
-    # The long tail of one model must not dominate the shared scale; a text states the number of values beyond its end.
+    # The long tail of one model must not dominate the shared scale; a label states how many values lie beyond its end.
     end = max(_FEW_MM, float(np.quantile([np.percentile(one.values_mm, 95) for one in samples], _SCALE_QUANTILE)))
     bins = np.linspace(0.0, end, _BINS + 1).tolist()
     for axis, one, label in zip(axes, samples, labels, strict=False):

@@ -29,7 +29,7 @@ except ModuleNotFoundError as error:
 _LAYER_EXTENSION = "GL_ARB_shader_viewport_layer_array"
 _MOST_PIXELS = 1 << 26  # maximum number of pixels in one layered texture, 64 MB
 _TILE_PX = 64  # side of the square tile in which one work group of 16 x 16 threads counts pixels
-_ROUND_PX = 64  # divisor of the texture sizes; they are rounded up to a multiple, so that frames can share textures
+_ROUND_PX = 64  # texture sizes [px] are rounded up to a multiple of this number, so that frames can share textures
 
 _VERTEX = f"""#version 430
 #extension {_LAYER_EXTENSION} : require
@@ -91,8 +91,8 @@ def open_context() -> moderngl.Context:
     except Exception as error:  # moderngl raises bare exceptions with the loader's text
         raise MissingDependencyError(
             f"drawing on the GPU needs OpenGL 4.3 through EGL, which did not start ({error}).",
-            hint="Install it, on Debian or Ubuntu: apt-get install libegl1 libgl1 libgl1-mesa-dri, or the graphics "
-            "card's own driver; or use the CPU backend.",
+            hint="On Debian or Ubuntu, install it with: apt-get install libegl1 libgl1 libgl1-mesa-dri. Otherwise, "
+            "install the graphics card's driver, or use the CPU backend.",
         ) from error
     if _LAYER_EXTENSION not in context.extensions:
         renderer = context.info["GL_RENDERER"]
@@ -138,7 +138,7 @@ class _Target:
 class GlCounter:
     """Pixel counter on the GPU; use it as a context manager, or close it.
 
-    Counters may share a context. All calls must come from the thread that opened it.
+    Counters may share a context. All calls must come from the thread that opened the context.
     """
 
     def __init__(
@@ -211,7 +211,9 @@ class GlCounter:
 
     def _count_part(self, poses: Array) -> NDArray[np.int64]:
         width, height, views = self._shown().size
-        clip = np.einsum("cij,njk->ncki", self._to_clip, poses)  # transposed, as GL is column-major
+        clip = np.einsum(
+            "cij,njk->ncki", self._to_clip, poses
+        )  # transposed, since OpenGL stores matrices column by column
         layers = len(poses) * views
         matrices = self._gl.buffer(np.ascontiguousarray(clip, np.float32))
         counts = self._gl.buffer(np.zeros(2 * layers, np.uint32))

@@ -250,7 +250,7 @@ def _twists(points: Array, root: Array) -> Array:
 
 
 def _only(components: Array, group: tuple[int, ...]) -> Array:
-    """Return the components with all components outside a group set to zero."""
+    """Return a copy of the components in which those outside a group are zero."""
     kept = np.zeros_like(components)
     kept[:, group] = components[:, group]
     return kept

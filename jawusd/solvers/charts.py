@@ -38,7 +38,7 @@ _SERIES_SQUARED = 0.09  # squared angle [rad^2] below which derivatives of the a
 
 
 def _glide(table: object, d2: Tensor, d3: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the glide table [mm] of a module at d2 (n,), d3 (n,) [mm], and its derivatives; zeros for None."""
+    """Return the values [mm] of a glide table at d2 (n,), d3 (n,) [mm], and their derivatives; zeros for None."""
     if not isinstance(table, MotionModule):
         return torch.zeros_like(d2), torch.zeros_like(d2), torch.zeros_like(d2)
     a, a_2 = _curve(table, "glide2", d2[:, None])
@@ -84,7 +84,7 @@ class AnchoredMotion(MotionModule):
         self._gliding = "glide_d2" in arrays
 
     def start(self, u: Tensor) -> Tensor:
-        """Return u, which is the chart coordinates."""
+        """Return u: the chart coordinates of this model are the displacements."""
         return u
 
     def derivative(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -120,7 +120,7 @@ class AnchoredMotion(MotionModule):
         return d, inverse(torch.stack([torch.stack(row, dim=1) for row in rows], dim=1))
 
     def attached(self, d: Tensor, by_x: Tensor, x: Tensor) -> Tensor:
-        """Return d with its derivatives with respect to u: a step of Newton's method adds the second derivatives."""
+        """Return d and its derivatives with respect to u; one Newton step supplies the second derivatives."""
         d = attached(d, by_x, x)
         u, _ = displacement(self._anchored_numbers().gauge, d[:, 0], d[:, 1], d[:, 2], TENSORS)
         error = torch.stack(u, dim=1) - x
@@ -153,7 +153,7 @@ class AnchoredMotion(MotionModule):
 
 
 class DirectMotion(MotionModule):
-    """A model of any kind; x is d. A subclass may have its derivative in closed form, which takes half the time."""
+    """A model of any kind; x is d. A subclass may provide the derivative in closed form, which halves the time."""
 
     starts: Tensor
     displacements: Tensor
@@ -165,7 +165,7 @@ class DirectMotion(MotionModule):
         self.register_buffer("displacements", torch.tensor(starts.displacements))
 
     def start(self, u: Tensor) -> Tensor:
-        """Return the grid point with the displacement nearest to u (n, 3) [mm]."""
+        """Return the grid point whose displacement is nearest to u (n, 3) [mm]."""
         grid = self.displacements
         return self.starts[(grid.square().sum(dim=1) - 2.0 * u @ grid.T).argmin(dim=1)]
 
@@ -174,7 +174,7 @@ class DirectMotion(MotionModule):
         axes = torch.eye(3, dtype=x.dtype, device=x.device)
         M, by_d = zip(*(torch.func.jvp(self.forward, (x,), (axis.expand_as(x),)) for axis in axes))
         R, t, change = M[0][:, :3, :3], M[0][:, :3, 3], torch.stack(by_d, dim=3)
-        # a change of d turns by dR R^T = [s] and shifts the origin by dt - s x t
+        # a change of d adds the rotation s, with dR R^T = [s], and shifts the origin by dt - s x t
         spin = torch.einsum("nijk,nlj->nilk", change[:, :3, :3], R)
         s = torch.stack([spin[:, 2, 1], spin[:, 0, 2], spin[:, 1, 0]], dim=1)
         return R, t, torch.cat([s, change[:, :3, 3] - _cross(s, t[:, :, None])], dim=1)
@@ -198,7 +198,7 @@ class AdditiveMotion(DirectMotion):
 
 
 def chart_of(kind: str, arrays: Mapping[str, Array]) -> AnchoredMotion | DirectMotion:
-    """Return the model, of the given kind, in its chart."""
+    """Return the chart of a model of the given kind."""
     if kind == ANCHORED:
         return AnchoredMotion(arrays)
     return AdditiveMotion(kind, arrays) if kind == ADDITIVE else DirectMotion(kind, arrays)
@@ -209,7 +209,7 @@ def _columns(slopes: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
 
 
 def _next_opening(x: Tensor, step: Tensor, low: Tensor, high: Tensor, iteration: int) -> Tensor:
-    """Return the next d1, as in `jawusd.evaluator.gauge`."""
+    """Return the next iterate of d1, as in `jawusd.evaluator.gauge`."""
     bounded = torch.isfinite(low) & torch.isfinite(high)
     late = max(iteration - PATIENCE, 0)
     stride = (step * 2.0 ** min(late, MAX_DOUBLINGS)).clamp(-INVERSE_STEP_MM, INVERSE_STEP_MM)

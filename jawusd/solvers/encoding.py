@@ -1,4 +1,4 @@
-"""The nearest pose of the model, for batches on any device: damped Gauss-Newton as in `jawusd.evaluator.solver`."""
+"""Find the nearest model poses of batches on any device, by damped Gauss-Newton as in `jawusd.evaluator.solver`."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from jawusd.solvers.solution import applied, attached, capturing, finished, inve
 Residual = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
 
 _STEPS_CAPTURED = 6
-# number of Newton steps after Gauss-Newton, which converges slowly for poses off the model
+# number of Newton steps after Gauss-Newton, which converges slowly for poses far from the model
 _NEWTON_STEPS, _NEWTON_STEPS_CAPTURED = 4, 2
 # addition to the Hessian, relative to its diagonal; keeps encodings differentiable where a parameter hardly moves the
 # landmarks

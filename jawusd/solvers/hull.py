@@ -32,9 +32,9 @@ from jawusd.solvers.solution import applied, capturing, finished, inverse
 
 _STEPS_CAPTURED, _PULLS_CAPTURED = 12, 2
 _START_DAMPING = 1e-3
-_POLISHING, _POLISH_MM = 2, 0.01  # number of final Newton steps, and their maximum accepted length
+_POLISHING, _POLISH_MM = 2, 0.01  # number of final Newton steps, and maximum accepted length of a step [mm]
 _VALLEYS = 4
-_ROWS = 512  # number of rows compared with all candidates at once
+_ROWS = 512  # number of rows compared at once with all candidates
 
 
 class Expansion(NamedTuple):

@@ -60,10 +60,10 @@ class Clearances(nn.Module):
 class TemporalPrior(nn.Module):
     """A prior on motion: squared Mahalanobis norms of velocity and acceleration of d, zero for a jaw at rest.
 
-    Both are modelled as normal with mean zero; the inverses of their covariances are buffers, float64.
+    Both are modelled as normally distributed with mean zero; the inverses of their covariances are buffers, float64.
 
     Args:
-        speeds: How fast the jaw moves: `JawRig.speeds`, or `Speeds.of_take`.
+        speeds: Statistics of the jaw's motion: `JawRig.speeds`, or `Speeds.of_take`.
     """
 
     velocity: Tensor
@@ -184,7 +184,7 @@ class JawLayer(nn.Module):
 
     @full_precision
     def project(self, d: Tensor) -> Tensor:
-        """Return the nearest jaw parameters (..., 3) [mm] with margin >= 0 to d (..., 3) [mm], as `JawRig.project`.
+        """Return the d (..., 3) [mm] with margin >= 0 nearest to given d (..., 3) [mm], as `JawRig.project` does.
 
         The derivative is the identity inside the bound; outside, it is that of the nearest point on the bound.
         """
@@ -209,7 +209,7 @@ class JawLayer(nn.Module):
 
     @full_precision
     def encode(self, T_skull_mandible: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the nearest jaw parameters and their landmark distance, as `JawRig.encode`.
+        """Return the nearest jaw parameters and their landmark distance, as `JawRig.encode` does.
 
         First and second derivatives with respect to the pose are exact, from the implicit function theorem on
         ``grad_d |pose(d) - T|^2 = 0``, including second derivatives of the model.
@@ -268,7 +268,7 @@ def _reject_other_rigs(layer: nn.Module, state: dict[str, Tensor], prefix: str, 
     """Reject the state of another rig before loading.
 
     Raises:
-        EvaluatorError: the state is of another rig or of an unknown one.
+        EvaluatorError: the state was saved with another rig, or does not name its rig.
     """
     found, own = state.get(f"{prefix}rig_hash"), layer.get_buffer("rig_hash").tolist()
     if found is None or found.tolist() != own:

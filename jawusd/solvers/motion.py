@@ -1,6 +1,6 @@
 """The model's formulas in torch: differentiable, in float32 or float64, on any device.
 
-A number is a column of a batch, shape (n, 1); a number that is an array (see `jawusd.evaluator.operations`) has shape
+A scalar of a formula is a column over the batch, shape (n, 1); an array (see `jawusd.evaluator.operations`) has shape
 (n, m).
 """
 
@@ -74,13 +74,13 @@ class TensorOperations:
 
     @staticmethod
     def lookup(x: Tensor, knots: Tensor, tables: Sequence[Tensor]) -> list[tuple[Tensor]]:
-        """Return the rows (n, k) of each table at the index given by the number of knots (m, 1) at or below x."""
+        """Return the rows (n, k) of each table, indexed by how many of the knots (m, 1) are at or below x."""
         interval = (x.detach() >= knots[:, 0]).sum(dim=1)
         return [(table[interval],) for table in tables]
 
     @staticmethod
     def split(row: Sequence[Tensor], width: int) -> Sequence[Tensor]:
-        """Return the columns (n, 1) of a number that is an array (n, width)."""
+        """Return the columns (n, 1) of an array (n, width)."""
         return row[0].split(1, dim=1)
 
 

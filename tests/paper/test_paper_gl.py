@@ -165,7 +165,7 @@ def test_wrong_shapes_are_refused(change) -> None:
         free = free[:, :-1]
     else:
         masks = free = masks[:, :0]
-    with RasterCounter(VERTICES, PLAIN, BOUNDARY) as counter, pytest.raises(ValueError, match="need shapes|free"):
+    with RasterCounter(VERTICES, PLAIN, BOUNDARY) as counter, pytest.raises(ValueError, match="masks must be|free"):
         counter.show(P, masks, free)
 
 
