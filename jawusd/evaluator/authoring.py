@@ -1,4 +1,4 @@
-"""Authoring on a rig: curves between key frames, slider ranges, and ranges normalised for retargeting."""
+"""Authoring with a rig: curves between key frames, slider ranges, and ranges normalised for retargeting."""
 
 from __future__ import annotations
 

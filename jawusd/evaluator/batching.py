@@ -36,7 +36,7 @@ def rows_of(values: ArrayLike, tail: tuple[int, ...], name: str) -> tuple[Array,
         ValueError: the trailing axes are not ``tail``, or `as_floats` rejects the values.
     """
     values = as_floats(values, name)
-    if values.shape == tail:  # fast path for one row
+    if values.shape == tail:  # fast path for a single row
         return values[None], ()
     batch = values.shape[: values.ndim - len(tail)]
     if values.ndim < len(tail) or values.shape[len(batch) :] != tail:

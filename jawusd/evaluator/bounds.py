@@ -231,7 +231,7 @@ class Ranges(NamedTuple):
 
 
 def normalized(bound: SliceHull, d_range: Array, d: Array) -> Array:
-    """Return d (n, 3) [mm] as fractions of the full opening (d1) and of the ranges on their sides there (d2, d3)."""
+    """Return d (n, 3) [mm] as fractions: d1 of the full opening, d2 and d3 of the ranges on their sides at d1."""
     return d / _scale(bound, d_range, d[:, 0], d)
 
 
@@ -275,7 +275,7 @@ class PolygonBound:
         )
 
     def signed_distance(self, d: Array) -> Array:
-        """Return the larger signed distance (n,) [mm] of d (n, 3) to either outline; negative inside both."""
+        """Return the larger of the signed distances (n,) [mm] of d (n, 3) to the two outlines; negative inside both."""
         lateral = _distance_to_edges(d[:, [0, 1]], self.opening_lateral)
         return np.maximum(lateral, _distance_to_edges(d[:, [0, 2]], self.opening_protrusion))
 

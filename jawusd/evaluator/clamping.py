@@ -17,7 +17,7 @@ from jawusd.evaluator.spine import INSET_MM, Spine, distances, moved_to_spine
 
 MAX_STRETCH = 1.045  # maximum factor by which a step may grow: 5 %, less an allowance for rounding
 
-_SAMPLE_MM = 0.2  # sample spacing near the bound
+_SAMPLE_MM = 0.2  # sample spacing [mm] near the bound
 _MAX_PIECES = 400  # maximum number of samples in one step
 # Maximum gradient norm of the margin: a step stays inside if the margin at both ends is at least this times the step
 # length.
@@ -28,7 +28,7 @@ _TIME_SHARE = 0.998  # fraction of the available time that a path may take; fine
 # `_NEAR_MM`.
 _CHECK_MM, _NEAR_MM, _MAX_ROUNDS, _ROUNDING_MM = 0.03, 1e-3, 8, 1e-9
 
-_LINE_MM = 0.1  # sample spacing of shortcuts
+_LINE_MM = 0.1  # sample spacing [mm] of shortcuts
 _SHORTCUTS = 24  # number of end points tried at once for a shortcut
 _TIGHT_POINTS, _TIGHT_ROUNDS, _TIGHT_GAIN_MM = 49, 20, 0.01
 # Fractions of the way to the straight line by which a segment is moved, in the order tried.
@@ -101,7 +101,7 @@ def _refined(bound: SliceHull, times: Array, d: Array) -> tuple[Array, Array, Ma
 
 
 def _runs(moved: Mask) -> list[tuple[int, int]]:
-    """Return first and last index of each run of moved samples, including one unmoved neighbour on each side."""
+    """Return the first and last index of each run of moved samples, including one unmoved neighbour on each side."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], moved, [False]]).astype(np.int8)))
     return [(max(int(a) - 1, 0), min(int(b), len(moved) - 1)) for a, b in zip(edges[::2], edges[1::2])]
 
@@ -182,7 +182,7 @@ def _leaves(bound: SliceHull, start: Array, end: Array) -> Mask:
     worst = np.maximum.reduceat(distance, first) if len(near) else distance
     close = np.flatnonzero((worst > -_NEAR_MM) & (worst <= _ROUNDING_MM))
     at = share[first[close] + _positions(distance == worst[line], first, count)[close]]
-    for shift in np.linspace(-1.0, 1.0, 17):  # points around the sample with the smallest margin
+    for shift in np.linspace(-1.0, 1.0, 17):  # look at points around the sample with the smallest margin
         closer = np.clip(at + shift / count[close], 0.0, 1.0)
         nearer = distances(bound, start[close] + closer[:, None] * offset[close])
         worst[close] = np.maximum(worst[close], nearer)

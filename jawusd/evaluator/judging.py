@@ -25,7 +25,7 @@ _scalar = cast("Callable[[float], Array]", np.float64)  # numpy's stubs do not t
 
 
 def _scalar_or_array(values: Array) -> Array:
-    """Return an array unchanged, and a 0-dimensional one as a number."""
+    """Return an array unchanged, but a 0-dimensional array as a number."""
     return values[()]
 
 
@@ -180,7 +180,7 @@ class GoodPose(NamedTuple):
 
     Attributes:
         time_s: Its time [s].
-        T_skull_mandible: The pose, shape (4, 4).
+        T_skull_mandible: Pose of the mandible, shape (4, 4).
         d: Its jaw parameters [mm], shape (3,).
     """
 

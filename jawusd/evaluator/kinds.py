@@ -198,6 +198,6 @@ def optional_of(kind: str) -> dict[str, dict[str, ArraySpec]]:
 
 
 def every_array() -> dict[str, ArraySpec]:
-    """Return the arrays of all kinds, also the optional ones, by name."""
+    """Return the arrays of all kinds of models, including optional ones, by name."""
     groups = [group for kind in KINDS for group in (arrays_of(kind), *optional_of(kind).values())]
     return {name: spec for group in groups for name, spec in group.items()}

@@ -1,4 +1,4 @@
-"""The search of `jawusd.evaluator.solver` for one row in plain floats: faster, and part of the single-file reader.
+"""The search of `jawusd.evaluator.solver` for one problem in floats: faster, and part of the single-file reader.
 
 In the search for the nearest point, a step first uses the full Hessian of the bound, and if that fails, only its
 positive semidefinite part.
@@ -30,7 +30,7 @@ PULL = 1.01  # overshoot factor of the iterations that move a point back onto th
 MIN_STIFFNESS = 1e-12  # minimum stiffness; keeps steps finite where the cost does not depend on a parameter
 # minimum squared gradient of the bound; keeps steps back onto the surface finite where the bound is flat
 MIN_SLOPE = 1e-6
-TOUCHING_MM = 1e-3  # maximum depth at which a start counts as lying on the bound
+TOUCHING_MM = 1e-3  # maximum depth [mm] at which a start counts as lying on the bound
 
 Vector = Triple[float]
 Symmetric = tuple[float, float, float, float, float, float]

@@ -145,7 +145,7 @@ class FloatOperations:
 
 
 def rows(flat: Sequence[float], width: int) -> Rows:
-    """Return a flat array as rows of ``width`` numbers."""
+    """Return a flat array split into rows of ``width`` numbers."""
     return [list(flat[i : i + width]) for i in range(0, len(flat), width)]
 
 

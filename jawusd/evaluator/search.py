@@ -22,7 +22,7 @@ Search = Callable[[Indices, Array], tuple[Array, Array]]
 
 _MAX_VALLEYS = 4
 _RIPPLE_STEPS = (-2.0, -1.0, 1.0, 2.0)
-_MAX_DRAG_MM = 3.0  # maximum change of d between two drag events; after a larger one, another basin may be better
+_MAX_DRAG_MM = 3.0  # maximum change of d [mm] between two drag events; after a larger one, another basin may be better
 _SCAN_ROWS = 64  # number of rows compared with all candidates at once; 64 x 6,000 distances take 3 MB
 
 

@@ -59,7 +59,7 @@ class SkinJaw(NamedTuple):
     Attributes:
         d: Jaw parameters [mm], shape (..., 3), not projected to the rig's bound; NaN where a column is not finite.
         covariance: Covariance of d [mm^2], shape (..., 3, 3).
-        familiar: The face resembles the training frames, shape (...); elsewhere d may be wrong by more than its
+        familiar: Whether the face resembles the training frames, shape (...); if not, d may be wrong by more than its
             covariance indicates.
     """
 
@@ -83,7 +83,7 @@ class Skin:
         arrays: Arrays of format jawusd-skin/1, read-only.
         meta: Header of the file.
         columns: Number of columns K.
-        points: The columns are x, y, z of points [mm].
+        points: Whether the columns are the coordinates x, y, z of points [mm].
     """
 
     def __init__(self, arrays: Mapping[str, Array], meta: Mapping[str, object]) -> None:

@@ -83,7 +83,7 @@ def _known(changes: Array) -> Array:
 
 
 def _denoised(seen: Array, noise: Array) -> Array:
-    """Subtract a noise covariance from an observed covariance (3, 3), keeping a minimum variance in every direction."""
+    """Subtract a noise covariance from an observed one, (3, 3) each, and keep a minimum variance in every direction."""
     floor = _MIN_SPREAD * np.trace(seen) / 3.0 + 1e-12
     root = np.linalg.cholesky(seen + floor * np.eye(3))
     share = np.linalg.solve(root, np.linalg.solve(root, noise).T)

@@ -16,7 +16,7 @@ from jawusd.base.errors import EvaluatorError
 from jawusd.evaluator.batching import in_chunks, pairs_in_chunks
 from jawusd.evaluator.bounds import SliceHull, largest_share
 
-INSET_MM = 0.01  # depth to which points are moved inside, so that lines between samples stay inside
+INSET_MM = 0.01  # depth [mm] to which points are moved inside, so that lines between samples stay inside
 
 _SLICES = 97
 _CAP_MM = 0.3  # depth of the spine's ends below the surface; openings beyond the ends are clamped

@@ -182,7 +182,7 @@ def _outside(margin_mm: Array, limits: Limits) -> Mask:
 
 
 def exceeds(moved_mm: Array, elapsed_s: ArrayLike, limit_mm_s: float) -> Mask:
-    """Return whether landmarks that moved by (..., L, 3) [mm] in a time (...) [s] exceeded a speed; False for NaN."""
+    """Return whether landmarks that moved by (..., L, 3) [mm] in times (...) [s] exceeded a limit; False for NaN."""
     travelled = np.sqrt((moved_mm**2).sum(axis=-1).max(axis=-1, initial=0.0))
     return np.asarray(travelled > limit_mm_s * np.asarray(elapsed_s))
 
