@@ -34,14 +34,14 @@ MEASURED = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 
 # Fraction of the mandible's rms speed below which the incisal point counts as standing still or reversing.
 _SLOWEST = 0.2
-_SHORTEST_MM = 0.01  # minimum motion of the incisal point along a curve; less motion indicates a collapsed network
+_SHORTEST_MM = 0.01  # minimum motion of the incisal point along a curve [mm]; less motion indicates a collapsed network
 
 _PIECES = (8, 6, 6)  # number of polynomial pieces of each of the three curves
 _ROUNDS = 8
 _SMOOTHING = 10.0 ** np.arange(-4.0, 5.0)
 _TAIL_RIDGE = 1e-4  # penalty that keeps coefficients finite in intervals without frames
 _HIDDEN_RIDGE = 1e9  # penalty that keeps coefficients at zero for parameters that the data do not excite
-_TRIM_FLOOR_MM = 0.8  # maximum residual that counts as model error and not as a tracking failure
+_TRIM_FLOOR_MM = 0.8  # maximum residual that counts as model error and not as a tracking failure [mm]
 _CV_BLOCK, _CV_FOLDS, _CV_CAP_MM = 25, 5, 1.0
 _LARGEST_CONDITION = 1e3
 

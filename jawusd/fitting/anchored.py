@@ -35,11 +35,11 @@ _SLIDE_SCALE_MM, _OPENING_SCALE_MM = 10.0, 40.0  # lengths that normalise the ar
 _DEGREE = 4
 _RIDGE = 1e-3
 _RANGE_PERCENTILES = (0.5, 99.5)  # slide percentiles outside which the eminence is extrapolated linearly
-_LANDMARK_SIGMA_MM = 10.0  # prior standard deviation of the kinematic centre about the landmark
-_PATH_SIGMA_MM = 0.3  # standard deviation of the distance of the kinematic centre from its path
+_LANDMARK_SIGMA_MM = 10.0  # prior standard deviation of the kinematic centre about the landmark [mm]
+_PATH_SIGMA_MM = 0.3  # standard deviation of the distance of the kinematic centre from its path [mm]
 _FRAMES_ALIKE = 25  # number of consecutive frames (one second) that count as one independent observation
 _NEWTON_STEPS, _LARGEST_STEP_RAD, _SETTLED_MM = 15, 0.1, 1e-6
-_FARTHER_MM = 4.0  # maximum extrapolation beyond the captured slides
+_FARTHER_MM = 4.0  # maximum extrapolation beyond the captured slides [mm]
 
 CENTRES = 80
 _ROUNDS = 4

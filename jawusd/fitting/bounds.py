@@ -35,7 +35,7 @@ KNOTS = 48
 SOFTNESS_MM = 0.1
 
 _PROTRUSION_STRETCH = 1.6  # factor that stretches protrusion, the shorter axis, before directions are spaced evenly
-_WINDOW_MM = 3.5  # maximum difference in opening between a section and the frames it is built from
+_WINDOW_MM = 3.5  # maximum difference in opening [mm] between a section and the frames from which it is built
 _FEWEST_IN_WINDOW = 12  # minimum number of frames per section; if the window has fewer, the nearest are used
 _TAPER = 0.35  # fraction by which a frame at the edge of the window is moved towards the section's median
 _KERNEL_KNOTS = 1.0  # standard deviation of the smoothing kernel over the opening, in knots
@@ -44,7 +44,7 @@ _FOLDS, _BLOCK = 5, 50  # number of folds, and length of their blocks [frames], 
 # 2) = 0.29 mm; with a margin below that, a section without extent (a parameter that the data do not excite) would be
 # empty.
 _MARGIN_MM = 0.38
-_CONTACT_TOLERANCE_MM = 0.05  # extension of the hull below the captured openings
+_CONTACT_TOLERANCE_MM = 0.05  # extension of the hull below the captured openings [mm]
 _FRAMES_PER_SLIP = 400  # number of frames per frame that noise may place beyond closed teeth
 _SHORTEST_RANGE_MM = 1.0
 _TOLERANCE_QUANTILE, _LARGEST_TOLERANCE_MM = 0.95, 1.0

@@ -18,9 +18,9 @@ from jawusd.geometry import landmark_frame, se3_inverse, so3_log
 _OPENING_MAX_MM = 75.0
 _LATERAL_MAX_MM = 20.0
 _PROTRUSION_MAX_MM = 16.0
-_RETRUSION_MAX_MM = 6.0  # maximum retrusion behind the habitual path, with the teeth nearly together
-_NEAR_CLOSED_MM = 5.0  # maximum opening at which protrusion and retrusion are measured
-_RISE_MAX_MM = 4.0  # maximum rise of the lower incisor above its position in the closed bite
+_RETRUSION_MAX_MM = 6.0  # maximum retrusion behind the habitual path [mm], with the teeth nearly together
+_NEAR_CLOSED_MM = 5.0  # maximum opening [mm] at which protrusion and retrusion are measured
+_RISE_MAX_MM = 4.0  # maximum rise of the lower incisor above its position in the closed bite [mm]
 _ROTATION_MAX_DEG = 57.0
 _CONDYLE_MAX_MM = 32.0
 _CONDYLES_APART_MM = (70.0, 140.0)

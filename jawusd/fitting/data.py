@@ -22,10 +22,10 @@ Source = Tracks | tuple[ArrayLike, ArrayLike]
 PARAMETERS = ("opening", "laterotrusion", "protrusion")
 #: Typical deviation of real jaws from a three-parameter model [mm]; smaller tracking errors hardly matter.
 MODEL_SIGMA_MM = 0.3
-_LARGEST_SIGMA_MM = 2.0  # maximum standard deviation of a pose (rms over the mandible); other poses are discarded
+_LARGEST_SIGMA_MM = 2.0  # maximum standard deviation of a pose [mm rms over the mandible]; other poses are discarded
 _RIGID = 1e-3
 _FEWEST_POSES = 15
-_SMALLEST_MOTION_MM = 1.0  # minimum 95 % quantile of the mandible's rms displacement from the first pose
+_SMALLEST_MOTION_MM = 1.0  # minimum 95 % quantile of the mandible's rms displacement from the first pose [mm]
 
 _FEWEST = 60  # minimum number of poses for outlier screening
 _TRIALS, _SAMPLE = (

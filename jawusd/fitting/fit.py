@@ -45,7 +45,7 @@ _MOST_CAPTURED = 2000  # maximum number of captured poses whose parameters a mod
 # Percentiles of the training and of the hold-out residuals. The larger value is the limit beyond which a measured pose
 # counts as off the model; 99.5 % of the take's own poses are within both this limit and the bound.
 _TRAINED_QUANTILE, _UNSEEN_QUANTILE = 99.8, 99.5
-_SMALLEST_RESIDUAL_LIMIT_MM = 0.1  # minimum residual limit, for noise-free training poses
+_SMALLEST_RESIDUAL_LIMIT_MM = 0.1  # minimum residual limit [mm], for noise-free training poses
 _FEW_POSES = 100
 
 #: Fitters by method; `jawusd.paper.model.FORMS` adds the fitter of the paper, which needs torch.
@@ -70,7 +70,7 @@ class FittingConfig:
     trim_mad: float = 4.5
     alpha: float = 0.23  # maximum triangle circumradius in the paper's alpha shapes [range-normalised units]
     starts: int = 4  # number of random initialisations of the networks of method "paper"; the best result is kept
-    seed: int = 0  # seed of the first initialisation
+    seed: int = 0  # random seed of the first initialisation
 
     def __post_init__(self) -> None:
         if self.method not in (methods := [*FORMS, "paper"]):

@@ -16,10 +16,10 @@ from jawusd.base.arrays import Array, Mask
 from jawusd.evaluator.gauge import Gauge
 
 SOFTNESS_MM = 2.0  # radius of the fillet at the apex of the gothic arch, d2 = 0; it keeps slider motion smooth there
-FADE_MM = 14.0  # opening at which tooth guidance has decreased to 1/e
+FADE_MM = 14.0  # opening [mm] at which tooth guidance has decreased to 1/e
 
 _PATH_DEGREE, _PATH_ITERATIONS, _PATH_RIDGE = 5, 40, 1e-5
-_SMALLEST_SPREAD_MM = 0.3  # minimum scale s of the residuals of the habitual path
+_SMALLEST_SPREAD_MM = 0.3  # minimum scale s of the residuals of the habitual path [mm]
 #: Minimum range of openings (1st to 99th percentile) for fitting a path [mm]; in a smaller range, closed teeth glide.
 SMALLEST_OPENING_MM = 5.0
 

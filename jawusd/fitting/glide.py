@@ -25,17 +25,17 @@ from jawusd.formats.model import JawModel
 from jawusd.geometry.se3 import make_transform
 from jawusd.meshes.contact import Teeth
 
-_STEP_MM = 0.5  # knot spacing; cusps and fossae are a few times wider
-_BEYOND_MM = 1.5  # distance beyond the captured parameters up to which contact is measured
+_STEP_MM = 0.5  # knot spacing [mm]; cusps and fossae are a few times wider
+_BEYOND_MM = 1.5  # distance beyond the captured parameters up to which contact is measured [mm]
 _HIGHEST_MM, _LOWEST_MM = 5.0, -2.5  # range of drops within which contact is searched
 _HALVINGS = 4  # number of bisections of the search step, which reduce it to 0.03 mm
 _SMOOTHING = 0.7  # standard deviation of the Gaussian filter, in knots
 _RAISES = 3  # number of iterations that restore the height lost in smoothing
-_REST_MM = 2.0  # radius around the closed bite, the bottom of the fossae, within which the surface is blended to 0
+_REST_MM = 2.0  # radius around the closed bite [mm], the bottom of the fossae, within which the surface is blended to 0
 # Maximum slopes along d2 and d3, in the order tried; steeper surfaces follow deep fossae more closely.
 _SLOPES = ((1.5, 1.0), (1.0, 0.7), (0.6, 0.4))
 _RANK_ERROR_MM = 0.03
-_GAUGE_ROOM_MM = 3.0  # margin around the captured parameters within which the gauge must be invertible
+_GAUGE_ROOM_MM = 3.0  # margin around the captured parameters within which the gauge must be invertible [mm]
 
 
 def follow_teeth(model: JawModel, teeth: Teeth) -> JawModel:

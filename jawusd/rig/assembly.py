@@ -17,7 +17,7 @@ from jawusd.rig.skel import bones_of
 
 _UNEVEN = 1e-3  # maximum relative difference of the three scales: 0.1 mm at jaw size, far above rounding
 _SIZES = 0.5, 2.0  # smallest and largest plausible scale of a head; scales outside this range come from wrong units
-_MM = 0.001  # a millimetre in metres
+_MM = 0.001  # one millimetre in metres
 _FIRST = Usd.TimeCode.EarliestTime()
 
 

@@ -30,8 +30,8 @@ _FIRST_NEWTON = 5  # first iteration with the full Hessian, which is often misle
 # double the number of correct digits, are taken without another evaluation of the model.
 _CONVERGED_MM = 1e-5
 _STARTS = (19, 11, 11)  # number of starts along d1, d2, d3
-_START_MARGIN_MM = 3.0  # extension of the grid beyond the bounds, for poses slightly outside
-_STEP_MM = 1e-3  # step of the finite differences in d
+_START_MARGIN_MM = 3.0  # extension of the grid beyond the bounds [mm], for poses slightly outside
+_STEP_MM = 1e-3  # step of the finite differences in d [mm]
 _START_DAMPING = 1e-6
 _MIN_DAMPING = 1e-12
 # Numbers of columns for a point of the search: d, its cost (squared distance), half the gradient of the cost, and half

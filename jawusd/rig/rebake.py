@@ -35,7 +35,7 @@ from jawusd.rig.table import landmark_distance
 from jawusd.rig.untrusted import raises_format_error
 
 Origin = Literal["d", "mandible"]
-_SAME_MM = 1e-6  # difference below which keys of d count as equal
+_SAME_MM = 1e-6  # difference [mm] below which keys of d count as equal
 
 
 class StageMotion(NamedTuple):

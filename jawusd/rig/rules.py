@@ -29,7 +29,7 @@ from jawusd.rig.skel import bones_of
 from jawusd.rig.table import landmark_distance, sample_valid
 from jawusd.rig.untrusted import VALUE_ERRORS, value_error_message
 
-_TABLE_SLACK_MM = 0.01  # tolerance on the stated error of the table, which was measured at other parameters
+_TABLE_SLACK_MM = 0.01  # tolerance on the stated error of the table [mm], which was measured at other parameters
 _OPS = [("xformOp:translate", "double3"), ("xformOp:orient", "quatd")]
 _PROBES = 500  # number of random valid d at which the table is compared with the model
 

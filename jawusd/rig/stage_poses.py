@@ -30,7 +30,7 @@ _POINTS = 2000  # maximum number of fitted vertices per mesh, evenly spaced by i
 # Maximum RMS distance of a fitted mesh. Exports in single precision, even in metres, stay far below it; other meshes
 # that happen to have the same number of vertices exceed it.
 _MAX_MISFIT_MM = 0.5
-_SAME_POINT_MM = 0.02  # points closer than this coincide; far above rounding, below a scan's vertex spacing
+_SAME_POINT_MM = 0.02  # distance [mm] below which points coincide; far above rounding, below a scan's vertex spacing
 _SKULL, _MANDIBLE = ("upper_teeth", "skull"), ("lower_teeth", "mandible")
 
 

@@ -19,7 +19,7 @@ from jawusd.evaluator.kinds import ADDITIVE
 from jawusd.evaluator.table import SampledTable
 from jawusd.geometry.se3 import se3_exp, transform_points
 
-DEFAULT_SIZE = 33  # knots per axis
+DEFAULT_SIZE = 33  # default number of knots per axis
 SIZES = (17, 33, 65)
 _VALID_SAMPLES = 10_000  # number of random valid d at which the error is measured
 _FULL_CHECKS = 200  # number of d with the largest errors, which are checked at every vertex
