@@ -16,14 +16,15 @@ from jawusd.geometry import LANDMARKS, rigid_fit, se3_inverse, transform_points
 
 UPPER_INCISOR = "upper_incisor"
 _FEWEST = 3
-_OUTLIER = 2.8  # standard deviations from which a point counts less: 95 % of 3-vectors lie nearer (chi distribution)
+# Distance [standard deviations] beyond which a point weighs less: 95 % of 3-vectors are shorter (chi distribution).
+_OUTLIER = 2.8
 _ROUNDS = 100
 _SETTLED = 1e-9  # change of weights at which the iteration ends
 # Largest median distance of the points after the fit, in standard deviations: at most 2.2 in ten markings of each of 20
 # synthetic heads; 18 and more with the unit wrong by a factor of 10.
 _LARGEST_MEDIAN = 4.0
-# Decrease of the sum of squares from which left and right count as exchanged: found in all of the same 200 markings if
-# exchanged, and in none if not.
+# Minimum decrease of the sum of squares for left and right to count as exchanged: found in all of the same 200 markings
+# if exchanged, and in none if not.
 _EXCHANGED = 20.0
 # Smallest distance of the points from a line, relative to their standard deviation there: the rotation about the line
 # is then uncertain by 20 degrees.

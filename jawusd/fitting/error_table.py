@@ -18,7 +18,8 @@ Refit = Callable[[TrainingData], FittedForm]
 #: Mean, median, p95, max [mm] and number of frames, by landmark or "mandible".
 ErrorTable = dict[str, dict[str, float]]
 
-_INSIDE_TWO_SD = 0.97  # fraction of errors below two sd; above 95 %, as new exercises are farther away
+# Fraction of errors below two standard deviations; above 95 %, since new exercises are farther away.
+_INSIDE_TWO_SD = 0.97
 _SLOWEST_GROWTH = 0.01  # minimum growth of errors with distance [mm/mm], used even if held-out errors do not grow
 
 

@@ -15,7 +15,7 @@ from jawusd.geometry import transform_points
 _REST_SHARE = 0.1  # fraction of the frames, nearest to the closed bite, from which the neutral weights are determined
 _DEAD_ZONES = np.linspace(0.0, 0.12, 13)  # candidate dead zones of each weight
 _ROUNDS = 2
-COARSE_S, _FINE_S, _FINE_STEPS = 0.1, 0.01, 15  # offset search: coarse step, fine step, fine steps to each side
+COARSE_S, _FINE_S, _FINE_STEPS = 0.1, 0.01, 15  # offset search: coarse and fine step [s], number of fine steps per side
 _BLOCKS = 5  # number of contiguous blocks in cross-validation
 _LEAST_SECONDS = 10.0
 _LEAST_REACH = 0.4  # minimum fraction of the subject's range that a take must reach in each direction
