@@ -11,7 +11,7 @@ from jawusd.base.errors import explain_missing_packages
 from jawusd.formats.mesh import Mesh
 from jawusd.formats.report import ReplayPart
 from jawusd.geometry.se3 import transform_points
-from jawusd.pipeline.view import viewed_actor
+from jawusd.pipeline.view import ContactView, rig_file, viewed_actor
 
 
 @explain_missing_packages()
@@ -20,13 +20,16 @@ def write_page(path: str | os.PathLike[str], out: Path, prim: str | None = None)
 
     Raises:
         OutputError: the file cannot be written.
+        RigError: the contacts of the teeth cannot be computed from the rig's meshes.
         MissingDependencyError: a package is missing.
     """
     from jawusd.report.pose_page import PosePage, write_pose_page
+    from jawusd.rig.read import describe
     from jawusd.rig.table import DEFAULT_SIZE, grid_axes, valid_box
     from jawusd.viewer.viewed import MOVING
 
-    actor = viewed_actor(path, prim)
+    file = rig_file(path)
+    actor = viewed_actor(file, prim)
     rig = actor.rig
     parts = []
     for name, mesh in actor.meshes.items():
@@ -36,6 +39,7 @@ def write_page(path: str | os.PathLike[str], out: Path, prim: str | None = None)
         parts.append(ReplayPart(name, kind, moves, Mesh(transform_points(T, mesh.vertices), mesh.faces)))
     moving = next(mesh for name, mesh in actor.meshes.items() if name in MOVING)
     clip = None if actor.take is None else actor.load_clip(actor.take)
+    painted = rig.contact is not None and {"upper_teeth", "lower_teeth"} <= set(actor.meshes)
     page = PosePage(
         name=actor.name,
         rig=rig,
@@ -44,5 +48,6 @@ def write_page(path: str | os.PathLike[str], out: Path, prim: str | None = None)
         take=np.zeros((0, 3)) if clip is None else clip.at(np.arange(clip.span[0], clip.span[1] + 1)),
         first=0 if clip is None else round(clip.span[0]),
         fps=actor.fps if clip is None else clip.fps,
+        teeth=ContactView(file, rig, str(describe(file, prim)["prim"])).teeth() if painted else None,
     )
     write_pose_page(out, page)

@@ -22,7 +22,7 @@ from jawusd.pipeline.contact import teeth_of
 from jawusd.pipeline.state import recorded_verdict
 
 if TYPE_CHECKING:
-    from jawusd.meshes.contact import ContactMap
+    from jawusd.meshes.contact import ContactMap, Teeth
     from jawusd.viewer.motion import Clip
     from jawusd.viewer.server import Viewer
     from jawusd.viewer.viewed import ViewedActor
@@ -68,8 +68,7 @@ def viewed_actor(path: str | os.PathLike[str], prim: str | None = None) -> Viewe
     from jawusd.rig.read import describe, load_rig
     from jawusd.viewer.viewed import ViewedActor
 
-    path = Path(path)
-    path = path / "actor.usda" if path.is_dir() else path
+    path = rig_file(path)
     rig, about = load_rig(path, prim), describe(path, prim)
     place, fps = about["prim"], float(about["fps"] or DEFAULT_FPS)
     return ViewedActor(
@@ -88,6 +87,12 @@ def viewed_actor(path: str | os.PathLike[str], prim: str | None = None) -> Viewe
     )
 
 
+def rig_file(path: str | os.PathLike[str]) -> Path:
+    """Return the file of a rig, given that file or the folder of a build."""
+    path = Path(path)
+    return path / "actor.usda" if path.is_dir() else path
+
+
 class ContactView:
     """Renders the contacts of a rig's teeth; the scans are loaded when the first image is drawn."""
 
@@ -97,9 +102,18 @@ class ContactView:
     @cached_property
     def _map(self) -> ContactMap:
         from jawusd.meshes.contact import ContactMap
+
+        return ContactMap(self.teeth())
+
+    def teeth(self) -> Teeth:
+        """Return both arches as solids.
+
+        Raises:
+            RigError: tooth contact cannot be computed from the rig's meshes.
+        """
         from jawusd.rig.geo import read_geometry
 
-        return ContactMap(teeth_of(self._rig, read_geometry(self._path, self._prim)))
+        return teeth_of(self._rig, read_geometry(self._path, self._prim))
 
     @explain_missing_packages()
     def draw(self, d: Array) -> NDArray[np.uint8]:

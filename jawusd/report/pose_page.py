@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from markupsafe import Markup
@@ -12,12 +13,17 @@ from jawusd.base.arrays import Array
 from jawusd.evaluator import JawRig
 from jawusd.evaluator.motions import motions_of_poses
 from jawusd.formats.atomic import write_text_atomic
+from jawusd.formats.mesh import DEEP, TOUCHING
 from jawusd.formats.report import ReplayPart
-from jawusd.geometry.se3 import se3_log
-from jawusd.report.replay import encoded, packed
+from jawusd.geometry.se3 import se3_log, transform_points
+from jawusd.report.contacts import contact_data
+from jawusd.report.replay import TRACED, encoded, packed
 from jawusd.report.templates import package_file, page_environment
 
-_SCRIPTS = ("scene.js", "decoder.js", "drag.js", "keys.js", "timeline.js", "pose.js")
+if TYPE_CHECKING:
+    from jawusd.meshes.contact import Teeth
+
+_SCRIPTS = ("scene.js", "decoder.js", "contacts.js", "drag.js", "keys.js", "timeline.js", "pose.js")
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,6 +37,7 @@ class PosePage:
     take: Array  # parameters of the take, frame by frame [mm], shape (F, 3); F = 0 without a take
     first: int  # first frame of the take
     fps: float  # frame rate of the take, and of keys
+    teeth: Teeth | None = None  # both arches, whose contacts are painted; None without contacts
 
 
 def write_pose_page(path: str | os.PathLike[str], page: PosePage) -> None:
@@ -47,6 +54,7 @@ def write_pose_page(path: str | os.PathLike[str], page: PosePage) -> None:
             style=package_file("report.css"),
             script=Markup().join(map(package_file, _SCRIPTS)),
             data=pose_data(page),
+            marks=(*TOUCHING, DEEP),
         )
     )
     write_text_atomic(path, text)
@@ -63,6 +71,8 @@ def pose_data(page: PosePage) -> dict[str, object]:
     twists = se3_log(motions_of_poses(rig.pose(d), rig.T_anatomical_skull, rig.T_rest))
     vertices = np.concatenate([part.mesh.vertices for part in page.parts if part.name != "skull"])
     low, high = vertices.min(0), vertices.max(0)
+    landmarks = transform_points(rig.T_anatomical_skull @ rig.T_rest, rig.landmarks)
+    clearance = rig.contact
     return {
         "parts": [packed(part) for part in page.parts],
         "axes": [axis.round(6).tolist() for axis in page.axes],
@@ -71,6 +81,8 @@ def pose_data(page: PosePage) -> dict[str, object]:
         "first": page.first,
         "fps": page.fps,
         "tolerance": rig.tolerance_mm,
+        "traced": landmarks[list(TRACED)].round(3).tolist(),
+        "contact": None if clearance is None or page.teeth is None else contact_data(clearance, page.teeth),
         "centre": (0.5 * (low + high)).round(2).tolist(),
         "radius": round(float(np.linalg.norm(high - low)) / 2, 2),
     }

@@ -16,6 +16,8 @@ from jawusd.geometry import transform_points
 
 #: Names of the tracking states of frames.
 STATES = ("tracked", "recovered after a loss", "tracked without a camera", "lost", "regularised by the model")
+#: Landmarks whose paths are drawn: the lower incisal point and both condyles.
+TRACED = (0, 3, 4)
 _MOST_FRAMES = 6000  # maximum number of frames; longer takes are subsampled
 _DEFAULT_FPS = 24.0
 
@@ -51,7 +53,7 @@ def replay_data(data: ReportData) -> dict[str, object] | None:
         "fps": float(data.model.notes.get("fps") or _DEFAULT_FPS) / step,
         "centre": (0.5 * (low + high)).round(2).tolist(),
         "radius": round(float(np.linalg.norm(high - low)) / 2, 2),
-        "traced": landmarks[[0, 3, 4]].round(3).tolist(),
+        "traced": landmarks[list(TRACED)].round(3).tolist(),
     }
 
 

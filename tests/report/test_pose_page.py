@@ -266,6 +266,51 @@ def test_the_keys_are_downloaded_as_files_that_animate_reads(keyed, tmp_path):
     np.testing.assert_allclose(d, interpolated(keyed.read_keys(), frames), atol=1e-4)
 
 
+def marked(jaw):
+    """Return how many pixels of the canvas have the colour of marked contacts: much red, little blue."""
+    red, green, blue = picture(jaw).reshape(-1, 3).T
+    return int(((red > 120) & (blue < 0.6 * red) & (red - blue > 90)).sum())
+
+
+def picture(jaw):
+    """Return the drawn jaw, shape (h, w, 3)."""
+    with Image.open(io.BytesIO(jaw.part("canvas").screenshot())) as image:
+        return np.asarray(image.convert("RGB")).astype(int)
+
+
+def test_contacts_are_painted_where_the_evaluator_finds_contact(jaw, rig):
+    jaw.web.wait_for_function("() => document.getElementById('jaw').dataset.clearance !== undefined")
+    boxes = [jaw.web.locator(f'[data-part="{part}"]') for part in ("skull", "upper_teeth", "gum")]
+    for box in [*boxes, jaw.part("paths")]:
+        box.uncheck()
+    jaw.web.click('[data-view="top"]')
+    counts = {}
+    for d in ((0, 0, 0), (0.5, 0.3, 0), (10, 0, 0)):
+        jaw.set_pose(d)
+        clearance = float(jaw.web.locator("#jaw").get_attribute("data-clearance"))
+        assert clearance == pytest.approx(float(rig.clearance(jaw.pose()[0]).clearance_mm), abs=1e-3)
+        counts[clearance] = marked(jaw)
+    (open_mm, bare), (closed_mm, contacts) = max(counts.items()), min(counts.items())
+    assert open_mm > 0.6 and bare == 0 and abs(closed_mm) < 0.05 and contacts > 50
+    jaw.part("close").click()
+    jaw.part("contacts").uncheck()
+    assert marked(jaw) == 0
+    for box in [*boxes, jaw.part("paths"), jaw.part("contacts")]:
+        box.check()
+
+
+@pytest.mark.parametrize("part", ["skull", "mandible", "upper_teeth", "lower_teeth", "gum", "paths"])
+def test_parts_are_shown_and_hidden(jaw, part):
+    jaw.part("source").select_option("take")
+    jaw.seek(57)
+    box = jaw.part(part) if part == "paths" else jaw.web.locator(f'[data-part="{part}"]')
+    shown = picture(jaw)
+    box.uncheck()
+    assert (np.abs(picture(jaw) - shown).sum(axis=2) > 30).sum() > 30
+    box.check()
+    np.testing.assert_array_equal(picture(jaw), shown)
+
+
 def test_on_a_phone_the_take_plays_and_the_timeline_is_in_reach(chromium, file):
     jaw = Jaw(chromium, file, 390, 844, color_scheme="dark", has_touch=True)
     first, _ = jaw.pose()

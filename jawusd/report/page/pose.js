@@ -13,6 +13,8 @@
   }
   const mm = (value) => (Math.round(value * 10) / 10 || 0).toFixed(1);
 
+  let clearance = null; // of the teeth at d [mm], once it is unpacked
+
   // -- motions: the take, rows of d1, d2, d3 and margin [mm], and the keys ---------------------------------------------
   const take = new Float32Array(bytesOf(data.take)), count = take.length / 4;
   const IDLE_S = 5; // length of the timeline without a take
@@ -30,9 +32,21 @@
     behind: (at) => (keyed() && count ? takeAt(at) : null),
     grade: (at, d) => {
       const off = -(keyed() ? decoder.margin(d) : takeAt(Math.round(at))[3]);
+      if (clearance?.(d) < data.contact?.clearance[keyed() ? "authored" : "measured"]) return 2;
       return off <= ROUNDING ? 0 : off <= data.tolerance ? 1 : 2;
     },
     keys: () => keys.all(),
+  };
+
+  // Return the paths of landmarks from a second before to a second after the frame.
+  const paths = () => {
+    const [low, high] = [-1, 1].map((side) => within(Math.round(frame + side * data.fps), ...span));
+    const poses = [];
+    for (let at = low; at <= high; at++) {
+      const d = motion.at(at);
+      if (d) poses.push(decoder.motion(d));
+    }
+    return poses.length < 2 ? [] : data.traced.map((point) => poses.flatMap((m) => moved(m, point)));
   };
 
   // -- the section of the bound at the current opening ---------------------------------------------------------------
@@ -61,7 +75,7 @@
   let now = [0, 0, 0], frame = span[0], running = false, started = 0, from = 0, held = null;
   const draw = () => {
     const m = decoder.motion(now);
-    scene?.draw(new Float32Array(m), []);
+    scene?.draw(new Float32Array(m), find("paths").checked ? paths() : []);
     drawSection();
     box.dataset.d = JSON.stringify(now);
     box.dataset.motion = JSON.stringify(m);
@@ -75,6 +89,12 @@
     const out = -margin > ROUNDING;
     const word = out ? `outside the bound${-margin <= data.tolerance ? ", within tolerance" : ""}` : "inside the bound";
     find("margin").textContent = `${mm(Math.abs(margin))} mm ${word}`;
+    if (clearance) {
+      const apart = clearance(d), hundredths = Math.abs(apart).toFixed(2);
+      const collide = apart < data.contact.clearance.authored ? ": teeth collide" : "";
+      find("clearance").textContent = `clearance ${apart < 0 ? "-" : ""}${hundredths} mm${collide}`;
+      box.dataset.clearance = apart;
+    }
     draw();
   };
   const seek = (at) => {
@@ -198,6 +218,21 @@
     });
   });
   connectView(box, canvas, scene, draw);
+  connectParts(box, scene, draw);
+  find("paths").addEventListener("change", draw);
+  find("contacts")?.addEventListener("change", () => {
+    if (scene) scene.painted = find("contacts").checked;
+    draw();
+  });
+  const openContacts = async () => {
+    if (!data.contact) return;
+    const fields = await openFields(data.contact.fields);
+    clearance = await makeClearance(data.contact.clearance);
+    scene?.paint(fields, data.contact.marks);
+    timeline.redraw();
+    show(now);
+  };
+  openContacts();
   canvas.addEventListener("pointerdown", (event) => {
     setRunning(false);
     held = { at: [event.clientX, event.clientY], point: dragging.grab(event, now) };

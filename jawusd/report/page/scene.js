@@ -3,7 +3,7 @@
 const bytesOf = (text) => Uint8Array.from(atob(text), (c) => c.charCodeAt(0)).buffer;
 
 // Return a scene drawn on a canvas. `data` has parts, centre and radius; `draw(body, lines)` draws the moving parts at a
-// column-major 4 x 4 motion (null hides them) and polylines, flat arrays of x, y, z.
+// column-major 4 x 4 motion (null hides them) and polylines, flat arrays of x, y, z. A part with `hidden` is not drawn.
 const makeScene = (canvas, data) => {
   const gl = canvas.getContext("webgl2", { antialias: true });
   if (!gl) return null;
@@ -37,7 +37,7 @@ const makeScene = (canvas, data) => {
   // -- camera --------------------------------------------------------------------------------------------------------
   const centre = data.centre;
   let turn = 0.6, tilt = 0.15, away = data.radius * 2.6;
-  const views = { front: [0, 0.05], left: [Math.PI / 2, 0.05], right: [-Math.PI / 2, 0.05], top: [0, 1.5] };
+  const views = { front: [0, 0.05], left: [Math.PI / 2, 0.05], right: [-Math.PI / 2, 0.05], top: [0, 1.5], below: [0, -1.5] };
   const camera = (aspect) => {
     const [cy, sy, cx, sx] = [Math.cos(turn), Math.sin(turn), Math.cos(tilt), Math.sin(tilt)];
     // x points to the subject's left, which is right in a front view
@@ -55,17 +55,26 @@ const makeScene = (canvas, data) => {
   // Depth offset of bone that nearly coincides with a scan, as roots and sockets do [mm].
   const BEHIND = { bone: 1.5, tooth: 0, gum: 0 };
   const vertexShader = `#version 300 es
-    in vec3 place; in vec3 normal; uniform mat4 all, body, view; uniform float behind, slope; out vec3 n;
+    in vec3 place; in vec3 normal; uniform mat4 all, body, view, opposing; uniform float behind, slope;
+    out vec3 n, there;
     void main() {
+      there = (opposing * vec4(place, 1.0)).xyz;
       n = mat3(view) * mat3(body) * normal;
       vec4 seen = all * body * vec4(place, 1.0);
       gl_Position = vec4(seen.xy, seen.w * (seen.z - slope * behind) / (seen.w + behind), seen.w);
     }`;
   const fragmentShader = `#version 300 es
-    precision highp float; in vec3 n; uniform vec4 color; uniform float lit; out vec4 shown;
+    precision highp float; precision highp sampler3D;
+    in vec3 n, there; uniform vec4 color; uniform float lit; out vec4 shown;
+    uniform sampler3D field; uniform vec3 origin, size; uniform vec2 scale; uniform vec4 marks[4]; uniform float painted;
     void main() {
       float light = lit > 0.5 ? 0.35 + 0.65 * abs(normalize(n).z) : 1.0;
-      shown = vec4(color.rgb * light * color.a, color.a);
+      vec3 base = color.rgb, at = (there - origin) / size;
+      if (painted > 0.5 && all(greaterThan(at, vec3(0.0))) && all(lessThan(at, vec3(1.0)))) {
+        float apart = scale.x + scale.y * texture(field, at.zyx).r;
+        for (int k = 3; k >= 0; k--) if (apart < marks[k].a) base = marks[k].rgb;
+      }
+      shown = vec4(base * light * color.a, color.a);
     }`;
   let at = null;
   const setUp = () => {
@@ -82,7 +91,9 @@ const makeScene = (canvas, data) => {
     if (!gl.getProgramParameter(program, gl.LINK_STATUS)) throw new Error(gl.getProgramInfoLog(program));
     gl.useProgram(program);
     at = {};
-    for (const name of ["all", "body", "view", "color", "lit", "behind", "slope"]) at[name] = gl.getUniformLocation(program, name);
+    const UNIFORMS = ["all", "body", "view", "color", "lit", "behind", "slope"];
+    const OF_MARKS = ["opposing", "origin", "size", "scale", "marks", "painted", "field"];
+    for (const name of [...UNIFORMS, ...OF_MARKS]) at[name] = gl.getUniformLocation(program, name);
     for (const part of parts) {
       part.array = gl.createVertexArray();
       gl.bindVertexArray(part.array);
@@ -112,10 +123,41 @@ const makeScene = (canvas, data) => {
     gl.vertexAttribPointer(0, 3, gl.FLOAT, false, 0, 0);
     gl.uniformMatrix4fv(at.body, false, identity);
     gl.uniform1f(at.lit, 0);
+    gl.uniform1f(at.painted, 0);
     gl.uniform1f(at.behind, 0);
     gl.uniform4f(at.color, ...color, 1);
     gl.drawArrays(gl.LINE_STRIP, 0, places.length / 3);
     gl.uniform1f(at.lit, 1);
+  };
+  // -- contacts: distances to the upper and to the lower arch as textures, painted on the teeth of the other one --------
+  let opposed = null;
+  const inverse = (m) => {
+    const back = (v) => [0, 1, 2].map((c) => m[4 * c] * v[0] + m[4 * c + 1] * v[1] + m[4 * c + 2] * v[2]);
+    const t = back([m[12], m[13], m[14]]).map((x) => -x);
+    return new Float32Array([m[0], m[4], m[8], 0, m[1], m[5], m[9], 0, m[2], m[6], m[10], 0, ...t, 1]);
+  };
+  const paint = (fields, marks) => {
+    gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
+    opposed = fields.map(({ origin, step, shape: [x, y, z], low, unit, values }, slot) => {
+      gl.activeTexture(gl.TEXTURE0 + slot);
+      gl.bindTexture(gl.TEXTURE_3D, gl.createTexture());
+      gl.texImage3D(gl.TEXTURE_3D, 0, gl.R8, z, y, x, 0, gl.RED, gl.UNSIGNED_BYTE, values);
+      for (const name of ["WRAP_S", "WRAP_T", "WRAP_R"])
+        gl.texParameteri(gl.TEXTURE_3D, gl[`TEXTURE_${name}`], gl.CLAMP_TO_EDGE);
+      for (const name of ["MIN", "MAG"]) gl.texParameteri(gl.TEXTURE_3D, gl[`TEXTURE_${name}_FILTER`], gl.LINEAR);
+      return { origin: origin.map((low) => low - step / 2), size: [x, y, z].map((n) => n * step), scale: [low, 255 * unit] };
+    });
+    gl.uniform4fv(at.marks, marks.flatMap(([red, green, blue, apart]) => [red / 255, green / 255, blue / 255, apart]));
+  };
+  const useField = (part, body) => {
+    const slot = part.moves ? 0 : 1, field = part.kind === "tooth" && api.painted && body ? opposed?.[slot] : null;
+    gl.uniform1f(at.painted, field ? 1 : 0);
+    if (!field) return;
+    gl.uniform1i(at.field, slot);
+    gl.uniformMatrix4fv(at.opposing, false, part.moves ? body : inverse(body));
+    gl.uniform3fv(at.origin, field.origin);
+    gl.uniform3fv(at.size, field.size);
+    gl.uniform2fv(at.scale, field.scale);
   };
   const draw = (body, lines) => {
     const width = Math.round(canvas.clientWidth * devicePixelRatio);
@@ -131,7 +173,8 @@ const makeScene = (canvas, data) => {
     gl.uniform1f(at.slope, lens[10]);
     for (const glassy of [false, true]) { // the translucent skull is drawn last
       for (const part of parts) {
-        if ((part.name === "skull") !== glassy || (part.moves && !body)) continue;
+        if ((part.name === "skull") !== glassy || (part.moves && !body) || part.hidden) continue;
+        useField(part, body);
         gl.uniformMatrix4fv(at.body, false, part.moves ? body : identity);
         gl.uniform4f(at.color, ...colors[part.kind], glassy ? 0.3 : 1);
         gl.uniform1f(at.behind, BEHIND[part.kind]);
@@ -152,7 +195,21 @@ const makeScene = (canvas, data) => {
   };
   const zoom = (step) => { away = Math.min(Math.max(away * Math.exp(step / 600), data.radius), data.radius * 10); };
   setUp();
-  return { draw, look, orbit, zoom, parts, identity, camera: () => camera(canvas.clientWidth / Math.max(canvas.clientHeight, 1)) };
+  const seen = () => camera(canvas.clientWidth / Math.max(canvas.clientHeight, 1));
+  const api = { draw, look, orbit, zoom, parts, identity, paint, painted: true, camera: seen };
+  return api;
+};
+
+// Connect the boxes that show and hide the parts of a scene, named by `data-part`; boxes without a part are hidden.
+const connectParts = (box, scene, draw) => {
+  for (const input of box.querySelectorAll("[data-part]")) {
+    const parts = scene?.parts.filter(({ name, kind }) => [name, kind].includes(input.dataset.part)) ?? [];
+    input.parentElement.hidden = !parts.length;
+    input.addEventListener("change", () => {
+      for (const part of parts) part.hidden = !input.checked;
+      draw();
+    });
+  }
 };
 
 // Connect the view buttons, the wheel and the size of the window to a scene; `draw` draws it again.
