@@ -1,13 +1,14 @@
 """Make the pictures of docs/gallery.md: python docs/make_gallery.py [out] [--only NAME ...] [-o FOLDER]
 
 `out` is the folder of `jawusd build examples/capture -o out`. A picture whose program is not installed is named and
-left as it was: `viewer` wants Chromium and playwright, `blender` the environment blender45 of
+left as it was: `viewer`, `pose_page` and `jaw` want Chromium and playwright, `blender` the environment blender45 of
 `tests/interop/make_environments.py` in the folder that JAWUSD_INTEROP names. `face_solver` takes minutes.
 """
 
 import argparse
 import contextlib
 import io
+import json
 import os
 import shutil
 import subprocess
@@ -33,6 +34,7 @@ from jawusd.paper.figures import condyle_figure
 from jawusd.pipeline.calibrate import sync_cameras
 from jawusd.pipeline.cameras import tracked_scans
 from jawusd.pipeline.pictures import open_wall
+from jawusd.pipeline.pose_page import write_page
 from jawusd.pipeline.report import run_paper_experiments
 from jawusd.pipeline.state import no_progress
 from jawusd.pipeline.subject import subject_of_build
@@ -50,6 +52,8 @@ TILE_PX = (320, 240)
 JAW_FRAMES = (42, 139)  # of the take, from one closed bite to the next
 JAW_PX, PANELS_PX = (640, 480), (324, 364)  # size of the picture, and of the panels to its left and right
 JAW_FROM_MM, JAW_AIM_MM = np.array([132.0, 0.0, 205.0]), np.array([0.0, -34.0, 0.0])  # camera and aim off the jaw
+# Keys of the pose page: place on the timeline, as a share of its length, and d [mm].
+KEYS_SHOWN = ((0.05, (0, 0, 0)), (0.25, (28, 0, 0)), (0.45, (12, 6, 1)), (0.62, (2, -5, 1)), (0.8, (18, 2, 3)))
 DRAWN_MS = 700  # until a pose is drawn without a graphics card
 PATIENCE_MS = 120_000  # for the page of the viewer, drawn without a graphics card
 
@@ -159,8 +163,8 @@ def condyles(out: Path, folder: Path) -> Path:
 
 
 @contextlib.contextmanager
-def viewed(out: Path, size_px: tuple[int, int]) -> Iterator[tuple[Viewer, Any]]:
-    """Open the page of `jawusd view` in Chromium, and yield its server and the page."""
+def browser_page(size_px: tuple[int, int]) -> Iterator[Any]:
+    """Yield an empty page of Chromium."""
     names = ("chromium", "chromium-browser", "google-chrome", "chrome")
     program = os.environ.get("CHROMIUM") or next(filter(None, map(shutil.which, names)), None)
     try:
@@ -169,19 +173,44 @@ def viewed(out: Path, size_px: tuple[int, int]) -> Iterator[tuple[Viewer, Any]]:
         raise NotInstalledError("playwright: pip install playwright") from None
     if program is None:
         raise NotInstalledError("Chromium: install it, or name it in CHROMIUM")
-    served = open_viewer(out, "127.0.0.1", 0, play=False)
     arguments = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
-    with contextlib.ExitStack() as stack:
-        stack.callback(served.stop)
-        playwright = stack.enter_context(sync_playwright())
+    with sync_playwright() as playwright:
         page = playwright.chromium.launch(executable_path=program, args=arguments).new_page(
-            viewport=dict(zip(("width", "height"), size_px, strict=True))
+            viewport=dict(zip(("width", "height"), size_px, strict=True)), reduced_motion="reduce"
         )
         page.set_default_timeout(PATIENCE_MS)
+        yield page
+
+
+@contextlib.contextmanager
+def viewed(out: Path, size_px: tuple[int, int]) -> Iterator[tuple[Viewer, Any]]:
+    """Open the page of `jawusd view` in Chromium, and yield its server and the page."""
+    with browser_page(size_px) as page, contextlib.ExitStack() as stack:
+        served = open_viewer(out, "127.0.0.1", 0, play=False)
+        stack.callback(served.stop)
         page.goto(served.url)
         page.wait_for_selector("text=nearest captured")
         page.locator(".mantine-Notification-closeButton").first.click()  # "Software WebGL" lies over the jaw
         yield served, page
+
+
+def pose_page(out: Path, folder: Path) -> Path:
+    """Photograph the page of `jawusd view --page` with keys."""
+    with tempfile.TemporaryDirectory() as made, browser_page((1440, 900)) as page:
+        write_page(out, Path(made) / "jaw.html")
+        page.goto((Path(made) / "jaw.html").as_uri())
+        page.wait_for_function("document.getElementById('jaw').dataset.clearance !== undefined")
+        timeline = page.locator('[data-jaw="timeline"]')
+        area, box = json.loads(timeline.get_attribute("data-area")), timeline.bounding_box()
+        for share, d in KEYS_SHOWN:
+            page.mouse.click(box["x"] + area["left"] + share * (area["right"] - area["left"]), box["y"] + 10)
+            page.click('[data-jaw="close"]')
+            for name, value in zip(("d1", "d2", "d3"), d, strict=True):
+                slider = page.locator(f'[data-jaw="{name}"]')
+                slider.evaluate("(e, v) => { e.value = v; e.dispatchEvent(new Event('input')); }", value)
+            page.click('[data-jaw="key"]')
+        picture = page.screenshot()
+    return save_webp(folder / "pose_page.webp", Image.open(io.BytesIO(picture)), 1200)
 
 
 def viewer(out: Path, folder: Path) -> Path:
@@ -246,7 +275,8 @@ def blender(out: Path, folder: Path, frames: int = FRAMES) -> Path:
     return path
 
 
-PICTURES = {made.__name__: made for made in (overlay, envelope, contacts, condyles, viewer, jaw, face_solver, blender)}
+_MADE = (overlay, envelope, contacts, condyles, viewer, pose_page, jaw, face_solver, blender)
+PICTURES = {made.__name__: made for made in _MADE}
 
 
 def main() -> int:

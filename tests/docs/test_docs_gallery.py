@@ -88,10 +88,12 @@ def test_condyles_overlay_and_viewer(example_build, gallery, tmp_path):
     assert all(near(frame, (0, 200, 255), 60) > 0.001 for frame in frames)  # outlines of the lower teeth
     try:
         picture = pixels(gallery.viewer(example_build[0], tmp_path))
+        keyed = pixels(gallery.pose_page(example_build[0], tmp_path))
         moving = Image.open(gallery.jaw(example_build[0], tmp_path, step=40))
     except gallery.NotInstalledError as needed:
         pytest.skip(str(needed))
     assert near(picture, (236, 229, 212), 40) > 0.005  # enamel
+    assert near(keyed, (0, 158, 115)) > 0.005  # the strip
     assert moving.n_frames == 3 and moving.size == gallery.JAW_PX
     assert all(near(frame_of(moving, frame), (236, 229, 212), 40) > 0.005 for frame in range(3))
 
