@@ -101,9 +101,9 @@ class Graph:
         self.nodes.append(helper.make_node("Split", [a.name], names, axis=axis))
         return [Value(self, name) for name in names]
 
-    def columns_of(self, a: Value, widths: Sequence[int]) -> list[Value]:
-        """Return groups of the columns of a value, of given widths."""
-        names = [f"{self.prefix}columns{len(self.nodes)}_{i}" for i in range(len(widths))]
+    def groups(self, a: Value, widths: Sequence[int]) -> list[Value]:
+        """Return groups of a value along axis 1, of given widths."""
+        names = [f"{self.prefix}group{len(self.nodes)}_{i}" for i in range(len(widths))]
         sizes = self.constant(widths, np.int64)
         self.nodes.append(helper.make_node("Split", [a.name, sizes.name], names, axis=1))
         return [Value(self, name) for name in names]
@@ -139,6 +139,16 @@ class Graph:
         """Return e of the inverse left Jacobian ``I - W / 2 + e W W``: ``(1 - a / (2 b)) / x`` (Barfoot 2017, 7.77)."""
         small, far, series = self._near_and_far(squared)
         return self.op("Where", small, series[3], (1.0 - a / (2.0 * b)) / far)
+
+    def angle_slopes(self, squared: Value, coefficients: Triple[Value]) -> tuple[Value, Value]:
+        """Return the derivatives of b and c by the squared angle x: ``(a - 2 b) / 2x`` and ``(b - 3 c) / 2x``."""
+        small, far, _ = self._near_and_far(squared)
+        a, b, c = coefficients
+        near = self.op("Min", squared, _SERIES_BELOW_RAD2)
+        slopes = [[k * value for k, value in enumerate(series)][1:] for series in long_angle_series()[1:]]
+        quotients = ((a - 2.0 * b) / (2.0 * far), (b - 3.0 * c) / (2.0 * far))
+        b_x, c_x = (self.op("Where", small, x, y) for x, y in zip(self.polynomials(slopes, near), quotients))
+        return b_x, c_x
 
     def _near_and_far(self, squared: Value) -> tuple[Value, Value, list[Value]]:
         """Return a mask of small squared angles, angles clipped for the closed forms, and the values of the series.

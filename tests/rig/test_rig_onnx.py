@@ -124,6 +124,28 @@ def test_encoder_inverts_the_decoder(kind, dtype, tolerance_mm):
     assert residual.max() < tolerance_mm
 
 
+@pytest.mark.parametrize("name", RIGS)
+def test_encoder_inverts_the_decoder_of_other_rigs(name):
+    """A measured glide surface, and splines with few or many centres."""
+    rig = RIGS[name]()
+    d = sample_valid(rig, 300, seed=12)
+    found, residual = search(rig, rig.pose(d), np.float64)
+    np.testing.assert_allclose(found, d, atol=1e-7)
+    assert residual.max() < 1e-9
+
+
+def test_one_pose_far_from_the_model_does_not_change_the_others(kind):
+    """The second loop runs for all rows if one has not converged."""
+    rig = example_rig(kind)
+    d = sample_valid(rig, 50, seed=13)
+    T = rig.pose(d)
+    far = se3_exp([0.3, -0.3, 0.2, 20.0, -15.0, 10.0]) @ T[:1]
+    (alone, _), (found, residual) = search(rig, far, np.float64), search(rig, np.concatenate([T, far]), np.float64)
+    assert residual[-1] > 5.0
+    np.testing.assert_allclose(found[:-1], d, atol=1e-7)
+    np.testing.assert_allclose(found[-1:], alone, atol=1e-6)
+
+
 def test_encoder_finds_what_the_evaluator_finds_for_noisy_poses(kind):
     rig = example_rig(kind)
     rng = np.random.default_rng(9)

@@ -1,0 +1,326 @@
+"""The charts of the kinds of models as ONNX operators: motions with derivatives, as in `jawusd.evaluator.models`.
+
+For single poses, the running time depends on the number of operators. Vectors and matrices of a row are therefore kept
+together in one value, except in the scalar formulas of the gauge.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+import onnx
+from onnx import TensorProto, helper
+
+from jawusd.base.arrays import Array
+from jawusd.evaluator import JawRig
+from jawusd.evaluator.arrays import flat_arrays
+from jawusd.evaluator.curve_formula import curve_derivatives
+from jawusd.evaluator.gauge import (
+    INVERSE_ITERATIONS,
+    INVERSE_STEP_MM,
+    MAX_DOUBLINGS,
+    MIN_INVERSE_SLOPE,
+    PATIENCE,
+    Elementary,
+    opening_equation,
+    spline_input,
+)
+from jawusd.evaluator.kinds import ADDITIVE, ANCHORED, MODELS
+from jawusd.evaluator.models import AdditiveModel, AnchoredModel
+from jawusd.evaluator.operations import Rows, triple
+from jawusd.geometry.rodrigues import Triple
+from jawusd.geometry.so3 import hat
+from jawusd.rig.onnx_graph import Graph, Value
+
+_OPENING_TOLERANCE = 1e-10  # step of the opening, relative to 1 mm plus the opening, below which it has converged
+# Maps 1, s, s^2, s^3 to themselves and their derivatives with respect to s.
+_POWERS = np.hstack([np.eye(4), np.diag([1.0, 2.0, 3.0], 1)])
+_HAT = hat(np.eye(3)).reshape(3, 9)  # maps rows (n, 3) to skew matrices (n, 9)
+
+
+@dataclass(frozen=True)
+class ChartMotion:
+    """A motion in the anatomical frame and its derivatives with respect to the chart, for rows of poses.
+
+    Attributes:
+        R: rotation, shape (n, 3, 3).
+        shift: displacement of the model's reference point [mm], shape (n, 1, 3).
+        w: spatial derivatives of the rotation [rad/mm], one row for each coordinate, shape (n, 3, 3).
+        shift_x: derivatives of the displacement, one row for each coordinate, shape (n, 3, 3), or (1, 3, 3).
+    """
+
+    R: Value
+    shift: Value
+    w: Value
+    shift_x: Value
+
+
+class Chart(Protocol):
+    """The chart of one model.
+
+    Attributes:
+        point: the reference point at rest, anatomical frame [mm], shape (3,).
+    """
+
+    point: Array
+
+    def start(self, g: Graph, u: Value) -> Value:
+        """Return starting points (n, 3) for motions that displace the lower incisal point by u (n, 3) [mm]."""
+
+    def motion(self, g: Graph, x: Value) -> ChartMotion:
+        """Return the motions at chart coordinates x (n, 3) [mm]."""
+
+    def parameters(self, g: Graph, x: Value) -> Value:
+        """Return the d (n, 3) [mm] of chart coordinates x (n, 3) [mm]."""
+
+
+class AnchoredChart:
+    """The displacement u of the lower incisal point, from which the spline gives the rotation."""
+
+    def __init__(self, rig: JawRig) -> None:
+        self._model = AnchoredModel.from_arrays(rig.arrays)
+        self._gauge, self.point = self._model.gauge.numbers, self._model.incisor
+
+    def start(self, g: Graph, u: Value) -> Value:
+        """Return the displacements themselves."""
+        return u
+
+    def motion(self, g: Graph, x: Value) -> ChartMotion:
+        """Return the motions that displace the incisal point by x (n, 3) [mm]."""
+        scales = self._model.scales
+        q, slopes = spline_input(self._gauge, scales.tolist(), triple(g.parts(x, 3)), self._elementary(g))
+        omega, omega_q = self._spline(g, g.concat(q))
+        # dq_i / dx_j: constant, except for the slopes of the habitual path in the row of y
+        by_slope, constant = np.zeros((2, 3, 3)), np.zeros((3, 3))
+        by_slope[0, 1, 1], by_slope[1, 1, 2] = 1.0 / scales[1:]
+        constant[1, 0], constant[0, 1], constant[2, 2] = -1.0 / scales[0], 1.0 / scales[1], 1.0 / scales[2]
+        q_x = g.concat(slopes) @ by_slope.reshape(2, 9) + g.constant(constant.reshape(1, 9))
+        omega_x = g.op("MatMul", g.reshape(q_x, [-1, 3, 3]), omega_q)
+        turning = _Turning.of(g, omega)
+        w = g.op("MatMul", omega_x, turning.left_transposed(g))
+        return ChartMotion(turning.rotation(g), g.reshape(x, [-1, 1, 3]), w, g.constant(np.eye(3)[None]))
+
+    def parameters(self, g: Graph, x: Value) -> Value:
+        """Return d by a search in the opening d1 alone, as `jawusd.evaluator.gauge.Gauge.inverse` does."""
+        u = triple(g.parts(x, 3))
+        zero = u[1] * 0.0
+        state = [-u[1], zero - np.inf, zero + np.inf, x]
+        some = g.op("Greater", g.op("Size", x), g.constant(0, np.int64))
+        outputs = [f"{g.prefix}opening", f"{g.prefix}low", f"{g.prefix}high", f"{g.prefix}parameters"]
+        names = [value.name for value in (g.constant(INVERSE_ITERATIONS, np.int64), some, *state)]
+        g.nodes.append(helper.make_node("Loop", names, outputs, body=self._opening_step(u)))
+        return Value(g, outputs[-1])
+
+    def _opening_step(self, u: Triple[Value]) -> onnx.GraphProto:
+        """Return the loop body: a Newton step, or the middle of the bracket if the step leaves it or has stalled."""
+        o = Graph(np.float64, "o_")
+        x, low, high = (Value(o, f"o_{name}") for name in ("opening", "low", "high"))
+        outer = triple([Value(o, value.name) for value in u])
+        d2, d3, remainder, slope = opening_equation(self._gauge, outer, x, self._elementary(o))
+        usable = o.op("Where", o.op("Greater", slope, MIN_INVERSE_SLOPE), slope, 1.0)
+        step = o.clip(-remainder / usable, -INVERSE_STEP_MM, INVERSE_STEP_MM)
+        lower = o.op("Where", o.op("Less", remainder, 0.0), x, low, name="o_low_out")
+        upper = o.op("Where", o.op("Greater", remainder, 0.0), x, high, name="o_high_out")
+        span = upper - lower
+        bounded = o.op("Less", span, np.inf)
+        late = o.op("Max", o.op("Cast", Value(o, "o_count"), to=TensorProto.DOUBLE) - float(PATIENCE), 0.0)
+        doubled = step * o.op("Pow", 2.0, o.op("Min", late, float(MAX_DOUBLINGS)))
+        stride = o.clip(doubled, -INVERSE_STEP_MM, INVERSE_STEP_MM)
+        newton = x + o.op("Where", bounded, step, stride)
+        leaves = o.op("Or", o.op("LessOrEqual", newton, lower), o.op("GreaterOrEqual", newton, upper))
+        odd = o.op("Greater", o.op("Mod", late, 2.0, fmod=1), 0.5)
+        halve = o.op("And", bounded, o.op("Or", leaves, odd))
+        size, allowed = o.op("Abs", step), (o.op("Abs", x) + 1.0) * _OPENING_TOLERANCE
+        done = o.op("LessOrEqual", size, allowed)
+        changed = o.op("Where", halve, lower + 0.5 * span, newton)
+        o.op("Where", done, x, changed, name="o_opening_out")
+        o.op("Where", done, o.concat([x, d2, d3]), np.nan, name="o_parameters_out")
+        # comparisons with NaN are false, so rows with NaN do not keep the loop running
+        moving = o.op("Cast", o.op("Greater", size, allowed), to=TensorProto.INT64)
+        o.op("Greater", o.op("ReduceSum", moving, keepdims=0), o.constant(0, np.int64), name="o_going_out")
+        return loop_body(o, "opening", {"opening": 1, "low": 1, "high": 1, "parameters": 3})
+
+    def _spline(self, g: Graph, q: Value) -> tuple[Value, Value]:
+        """Return the spline at q (n, 3), shape (n, 3), and its gradient, (n, 3 inputs, 3 outputs).
+
+        See `AnchoredModel`: sums of r_i times W_i, W_i c_i and W_i |c_i|^2 give both.
+        """
+        model = self._model
+        centres, squares = model.centres, model.centres_squared
+        kernel, linear = model.weights[: len(centres)], model.weights[len(centres) :]
+        squared = g.sum_columns(q * q)
+        apart = g.concat([q, squared]) @ np.vstack([-2.0 * centres.T, np.ones(len(centres))])
+        r = g.sqrt(g.op("Max", apart + g.constant(squares[None]), 0.0))
+        factors = np.concatenate([np.ones((len(centres), 1)), centres, squares[:, None]], axis=1)
+        sums = g.reshape(r @ (factors[:, :, None] * kernel[:, None]).reshape(len(centres), 15), [-1, 5, 3])
+        monomials = g.concat([squared, q * -2.0, zero_column(g, q) + 1.0])
+        value = g.reshape(g.op("MatMul", g.reshape(monomials, [-1, 1, 5]), sums), [-1, 3])
+        plain, by_centre, _ = g.groups(sums, [1, 3, 1])
+        gradient = 3.0 * (g.reshape(q, [-1, 3, 1]) * plain - by_centre) + g.constant(linear[None])
+        return value + q @ linear - g.constant(model.offset[None]), gradient
+
+    def _elementary(self, g: Graph) -> Elementary[Value]:
+        return Elementary(g.sqrt, g.exp, g.clip, lambda _, d2, d3: self._glide(g, d2, d3))
+
+    def _glide(self, g: Graph, d2: Value, d3: Value) -> Triple[Value]:
+        """Return the drop of the glide table [mm] and its derivatives with respect to d2 and d3, each (n, 1)."""
+        table = self._model.gauge.glide
+        if table is None:
+            nothing = g.constant([[0.0]])
+            return nothing, nothing, nothing
+        count, rows = len(table.starts[1]), []
+        cells = [self._interval(g, d, knots) for d, knots in zip((d2, d3), table.knots, strict=True)]
+        for d, cell, starts in zip((d2, d3), cells, table.starts, strict=True):
+            s = d - g.op("Gather", g.constant(starts[:, None]), cell, axis=0)
+            square = s * s
+            # rows 1, s, s^2, s^3 and their derivatives
+            powers = g.concat([s, square, square * s]) @ _POWERS[1:] + g.constant(_POWERS[:1])
+            rows.append(g.reshape(powers, [-1, 2, 4]))
+        cell = cells[0] * g.constant(count, np.int64) + cells[1]
+        coefficients = g.reshape(
+            g.op("Gather", g.constant(table.coefficients.reshape(-1, 16)), cell, axis=0), [-1, 4, 4]
+        )
+        across = g.op("Transpose", rows[1], perm=[0, 2, 1])
+        product = g.op("MatMul", g.op("MatMul", rows[0], coefficients), across)
+        value, by_3, by_2, _ = g.parts(g.reshape(product, [-1, 4]), 4)
+        return value, by_2, by_3
+
+    @staticmethod
+    def _interval(g: Graph, d: Value, knots: Array) -> Value:
+        """Return the number of knots at or below d (n, 1), shape (n,)."""
+        passed = g.op("Cast", g.op("GreaterOrEqual", d, g.constant(knots[None])), to=TensorProto.INT64)
+        return g.op("ReduceSum", passed, g.constant([1], np.int64), keepdims=0)
+
+
+class AdditiveChart:
+    """The jaw parameters d, which the curves map to twists."""
+
+    def __init__(self, rig: JawRig) -> None:
+        self._model = AdditiveModel.from_arrays(rig.arrays)
+        self._tables = MODELS[ADDITIVE](flat_arrays(rig.arrays)).tables
+        self.point = np.zeros(3)
+
+    def start(self, g: Graph, u: Value) -> Value:
+        """Return the grid points whose incisal displacement is nearest."""
+        starts = self._model.starts
+        # |a - b|^2 without |b|^2, which is the same for all grid points
+        squares = (starts.displacements**2).sum(axis=1)
+        distance = u @ (-2.0 * starts.displacements.T) + g.constant(squares[None])
+        nearest = g.op("Gather", g.constant(starts.d), g.op("ArgMin", distance, axis=1, keepdims=0), axis=0)
+        return nearest + zero_column(g, u)
+
+    def motion(self, g: Graph, x: Value) -> ChartMotion:
+        """Return the motions at d = x (n, 3) [mm]."""
+        tables = stored(self._tables)
+        curves = [curve_derivatives(f"curve{i}", d, tables, g) for i, d in enumerate(g.parts(x, 3), start=1)]
+        (first,), (second,), (third,) = (value for value, _, _ in curves)
+        omega, v = g.parts(first + second + third, 2)
+        slopes = g.reshape(g.concat([slope for _, (slope,), _ in curves]), [-1, 3, 6])
+        omega_x, v_x = g.parts(slopes, 2, axis=2)
+        turning = _Turning.of(g, omega)
+        left = turning.left_transposed(g)
+        row = g.reshape(v, [-1, 1, 3])
+        along = g.op("MatMul", omega_x, turning.left_change_transposed(g, v))
+        shift_x = g.op("MatMul", v_x, left) + along
+        return ChartMotion(turning.rotation(g), g.op("MatMul", row, left), g.op("MatMul", omega_x, left), shift_x)
+
+    def parameters(self, g: Graph, x: Value) -> Value:
+        """Return x."""
+        return x
+
+
+CHARTS: dict[str, type[AnchoredChart] | type[AdditiveChart]] = {ANCHORED: AnchoredChart, ADDITIVE: AdditiveChart}
+
+
+@dataclass(frozen=True)
+class _Turning:
+    """Powers of the skew matrix W of rotation vectors, and the coefficients of Rodrigues' formula.
+
+    Attributes:
+        omega: rotation vectors [rad], shape (n, 3).
+        squared: their squared lengths [rad^2], shape (n, 1).
+        W, WW: the skew matrix and its square, shape (n, 9).
+        coefficients: a, b and c of `jawusd.geometry.rodrigues`, shape (n, 1) each.
+    """
+
+    omega: Value
+    squared: Value
+    W: Value
+    WW: Value
+    coefficients: Triple[Value]
+
+    @classmethod
+    def of(cls, g: Graph, omega: Value) -> _Turning:
+        """Compute them for rotation vectors (n, 3) [rad]."""
+        W, squared = omega @ _HAT, g.sum_columns(omega * omega)
+        matrix = g.reshape(W, [-1, 3, 3])
+        WW = g.reshape(g.op("MatMul", matrix, matrix), [-1, 9])
+        return cls(omega, squared, W, WW, g.angle_coefficients(squared))
+
+    def rotation(self, g: Graph) -> Value:
+        """Return the rotation matrix, shape (n, 3, 3)."""
+        a, b, _ = self.coefficients
+        return self._matrix(g, self.W * a + self.WW * b)
+
+    def left_transposed(self, g: Graph) -> Value:
+        """Return the transposed left Jacobian, shape (n, 3, 3)."""
+        _, b, c = self.coefficients
+        return self._matrix(g, self.WW * c - self.W * b)  # W is antisymmetric, W W symmetric
+
+    def left_change_transposed(self, g: Graph, v: Value) -> Value:
+        """Return the transposed derivative of the left Jacobian times v (n, 3), with respect to omega, (n, 3, 3).
+
+        It is ``2 (b' W v + c' W W v) omega^T - b [v] - c (W [v] + [W v])``, where [v] is the skew matrix of v, and b'
+        and c' are derivatives with respect to the squared angle.
+        """
+        _, b, c = self.coefficients
+        b_x, c_x = g.angle_slopes(self.squared, self.coefficients)
+        W = g.reshape(self.W, [-1, 3, 3])
+        skew = v @ _HAT
+        once = g.reshape(g.op("MatMul", W, g.reshape(v, [-1, 3, 1])), [-1, 3])
+        twice = g.reshape(g.op("MatMul", W, g.reshape(once, [-1, 3, 1])), [-1, 3])
+        along = 2.0 * (once * b_x + twice * c_x)
+        outer = g.op("MatMul", g.reshape(self.omega, [-1, 3, 1]), g.reshape(along, [-1, 1, 3]))
+        # [v]^T = -[v], and (W [v])^T = [v] W
+        product = g.reshape(g.op("MatMul", g.reshape(skew, [-1, 3, 3]), W), [-1, 9])
+        return outer + g.reshape(skew * b + (once @ _HAT - product) * c, [-1, 3, 3])
+
+    @staticmethod
+    def _matrix(g: Graph, flat: Value) -> Value:
+        return g.reshape(flat + g.constant(np.eye(3).reshape(1, 9)), [-1, 3, 3])
+
+
+def moved_vectors(g: Graph, w: Value, vectors: Value) -> Value:
+    """Return the cross products of w_j (n, 3, 3) and column vectors (n, 3, k), shape (n, 3 j, 3 k)."""
+    skew = g.reshape(w @ _HAT, [-1, 9, 3])
+    return g.op("MatMul", skew, vectors)
+
+
+def loop_body(g: Graph, name: str, state: dict[str, int]) -> onnx.GraphProto:
+    """Return a graph as the body of a loop over columns: the values NAME become NAME_out, with the prefix of the graph.
+
+    Args:
+        state: number of columns of each value that an iteration passes to the next one.
+    """
+
+    def columns(suffix: str) -> list[onnx.ValueInfoProto]:
+        return [
+            helper.make_tensor_value_info(f"{g.prefix}{key}{suffix}", TensorProto.DOUBLE, ["N", width])
+            for key, width in state.items()
+        ]
+
+    counter = helper.make_tensor_value_info(f"{g.prefix}count", TensorProto.INT64, [])
+    going, out = (helper.make_tensor_value_info(f"{g.prefix}going{s}", TensorProto.BOOL, []) for s in ("", "_out"))
+    return helper.make_graph(g.nodes, name, [counter, going, *columns("")], [out, *columns("_out")], g.initializers)
+
+
+def zero_column(g: Graph, rows: Value) -> Value:
+    """Return zeros (n, 1), NaN for rows with a NaN."""
+    return g.sum_columns(rows) * 0.0
+
+
+def stored(tables: dict[str, Rows]) -> dict[str, Array]:
+    """Return tables in the form in which graphs store them."""
+    return {name: np.array(table) for name, table in tables.items()}
