@@ -36,7 +36,8 @@ def replay_data(data: ReportData) -> dict[str, object] | None:
     d = _parameters_at(tracks.frames[rows], data)
     fitted = np.full((len(rows), 4, 4), np.nan)
     known = np.all(np.isfinite(d), axis=1)
-    fitted[known] = JawRig(model.arrays, model.meta).pose(d[known])
+    rig, margin = JawRig(model.arrays, model.meta), np.full(len(rows), np.nan)
+    fitted[known], margin[known] = rig.pose(d[known]), rig.margin(d[known])
     # The virtual camera is aimed at the jaw; the skull is ignored.
     jaw = [part.mesh.vertices for part in data.parts if part.name != "skull"] or [data.parts[0].mesh.vertices]
     low, high = np.concatenate(jaw).min(0), np.concatenate(jaw).max(0)
@@ -47,6 +48,8 @@ def replay_data(data: ReportData) -> dict[str, object] | None:
         "captured": _poses(motions_of_poses(tracks.T_upper_lower[rows], A, rest)),
         "fitted": _poses(motions_of_poses(fitted, A, rest)),
         "d": encoded(d.astype("<f4")),
+        "margin": encoded(margin.astype("<f4")),
+        "tolerance": rig.tolerance_mm,
         "frames": encoded(tracks.frames[rows].astype("<i4")),
         "state": encoded(_states(tracks)[rows]),
         "states": list(STATES),

@@ -1,11 +1,14 @@
 """The report opened from disk in a browser: light and dark, no requests, no console errors, a moving replay."""
 
+import io
+import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import trimesh
 from browser import headless_chromium, keep_picture, open_page
+from PIL import Image
 from report_data import experiments, report_data, solve_data, write_document
 
 from jawusd.formats.mesh import Mesh
@@ -46,16 +49,15 @@ def part(page, name):
 
 def picture(page):
     """Return the rendered replay, (h, w, 3)."""
-    import io
-
-    from PIL import Image
-
     with Image.open(io.BytesIO(part(page, "canvas").screenshot())) as image:
         return np.asarray(image.convert("RGB")).astype(int)
 
 
 def move_to(page, row):
-    part(page, "slider").evaluate("(e, v) => { e.value = v; e.dispatchEvent(new Event('input')); }", row)
+    press = "e.dispatchEvent(new KeyboardEvent('keydown', { key }))"
+    part(page, "timeline").evaluate(
+        f"(e, keys) => {{ for (const key of keys) {press}; }}", ["Home"] + ["ArrowRight"] * row
+    )
 
 
 def ball(name, kind, radius, place=(0.0, 0.0, 0.0)):
@@ -111,7 +113,7 @@ def test_tables_are_folded_and_a_link_opens_them(chromium, tmp_path):
     write_document(tmp_path / "report.html", report_data(experiments=experiments(sentences=("Gap: record chewing.",))))
     page = open_page(chromium, 1440, 900)
     page.goto((tmp_path / "report.html").as_uri())
-    bottoms = page.locator(".verdict, #todo, #overlay h2, #replay canvas").evaluate_all(
+    bottoms = page.locator(".verdict, #todo, #overlay h2, [data-replay=canvas]").evaluate_all(
         "all => all.map(e => e.getBoundingClientRect().bottom)"
     )
     assert len(bottoms) == 4 and max(bottoms) < 900 and not page.locator("table").first.is_visible()
@@ -163,6 +165,28 @@ def test_the_replay_shows_the_frame_that_is_asked_for(opened):
     assert part(page, "frame").inner_text() == f"frame {data.model.frames[20]}, lost"
     page.locator("[data-frame]").first.click()
     assert part(page, "frame").inner_text().startswith(f"frame {data.overlays[0].frame},")
+
+
+def test_the_timeline_of_the_replay_scrubs_shows_the_bound_and_parts_are_hidden(opened):
+    page, data, scheme = opened
+    move_to(page, 0)
+    area = json.loads(part(page, "timeline").get_attribute("data-area"))
+    box, (first, last) = part(page, "timeline").bounding_box(), area["view"]
+    at = [
+        area["left"] + (data.model.frames[row] - first) / (last - first) * (area["right"] - area["left"])
+        for row in (20, 30)
+    ]
+    page.mouse.click(box["x"] + at[1], box["y"] + 10)
+    assert part(page, "frame").inner_text() == f"frame {data.model.frames[30]}, tracked"
+    move_to(page, 0)
+    with Image.open(io.BytesIO(part(page, "timeline").screenshot())) as shown:
+        lost, tracked = (shown.convert("RGB").getpixel((round(x), 24)) for x in at)
+    green = (0, 158, 115) if scheme == "light" else (53, 199, 155)
+    assert np.abs(np.subtract(tracked, green)).max() < 8
+    assert np.ptp(lost) < 20  # grey
+    shown = picture(page)
+    page.locator('[data-part="tooth"]').uncheck()
+    assert (np.abs(picture(page) - shown).sum(axis=2) > 30).sum() > 30
 
 
 @pytest.mark.slow

@@ -1,5 +1,4 @@
 // The sampled decoder of a rig: motions of the jaw and the margin to the bound at jaw parameters d [mm].
-const within = (x, low, high) => Math.min(Math.max(x, low), high);
 const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 const minus = (a, b) => [a[0] - b[0], a[1] - b[1], a[2] - b[2]];
 const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];

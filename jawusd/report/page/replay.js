@@ -19,11 +19,12 @@
   if (!box) return;
   const data = JSON.parse(document.getElementById("replay-data").textContent);
   const find = (name) => box.querySelector(`[data-replay="${name}"]`);
-  const canvas = find("canvas"), slider = find("slider"), play = find("play"), source = find("source");
+  const canvas = find("canvas"), play = find("play"), source = find("source");
 
   const captured = new Float32Array(bytesOf(data.captured)), fitted = new Float32Array(bytesOf(data.fitted));
   const d = new Float32Array(bytesOf(data.d)), frames = new Int32Array(bytesOf(data.frames));
   const state = new Uint8Array(bytesOf(data.state));
+  const margin = new Float32Array(bytesOf(data.margin)); // to the bound [mm]
   const count = frames.length;
   let now = 0, running = false;
 
@@ -55,10 +56,37 @@
     scene.draw(known(poses, now) ? rigid(poses, now) : null, data.traced.map((point) => trace(poses, point)));
   };
 
+  // -- timeline ------------------------------------------------------------------------------------------------------
+  const nearest = (frame) => {
+    const next = frames.findIndex((each) => each >= frame);
+    if (next <= 0) return next < 0 ? count - 1 : 0;
+    return frames[next] - frame <= frame - frames[next - 1] ? next : next - 1;
+  };
+  const motion = {
+    span: () => [frames[0], Math.max(frames[count - 1], frames[0] + 1)],
+    at: (frame) => {
+      const next = frames.findIndex((each) => each >= frame), k = next < 0 ? count - 1 : next, before = Math.max(k - 1, 0);
+      const t = within((frame - frames[before]) / (frames[k] - frames[before] || 1), 0, 1);
+      return [0, 1, 2].map((i) => d[3 * before + i] + t * (d[3 * k + i] - d[3 * before + i]));
+    },
+    grade: (frame) => {
+      const k = nearest(frame), out = -margin[k];
+      if (data.states[state[k]] === "lost") return null;
+      return out <= 0 ? 0 : out <= data.tolerance ? 1 : 2;
+    },
+    step: count > 1 ? frames[1] - frames[0] : 1,
+  };
+  const timeline = makeTimeline(find("timeline"), motion, {
+    seek: (frame) => {
+      setRunning(false);
+      show(nearest(frame));
+    },
+  });
+
   // -- controls ------------------------------------------------------------------------------------------------------
   const show = (index) => {
     now = Math.min(Math.max(Math.round(index), 0), count - 1);
-    slider.value = now;
+    timeline.show(frames[now]);
     const values = [0, 1, 2].map((i) => d[3 * now + i]);
     const mm = (value) => (Number.isFinite(value) ? (Math.round(value * 10) / 10 || 0).toFixed(1) : "\u2013");
     find("d").textContent = values.map((value, i) => `d${i + 1} ${mm(value)}`).join("   ") + "   mm";
@@ -80,13 +108,9 @@
     }
   };
   play.addEventListener("click", () => setRunning(!running));
-  slider.max = count - 1;
-  slider.addEventListener("input", () => {
-    setRunning(false);
-    show(Number(slider.value));
-  });
   source.addEventListener("change", draw);
   connectView(box, canvas, scene, draw);
+  connectParts(box, scene, draw);
   let held = null;
   canvas.addEventListener("pointerdown", (event) => {
     held = [event.clientX, event.clientY];
@@ -107,5 +131,6 @@
       show(index);
       box.scrollIntoView({ behavior: "smooth", block: "center" });
     });
+  timeline.redraw();
   show(0);
 })();

@@ -1,6 +1,7 @@
 "use strict";
 // A jaw in plain WebGL2, without external resources. Coordinates are mm in the anatomical frame.
 const bytesOf = (text) => Uint8Array.from(atob(text), (c) => c.charCodeAt(0)).buffer;
+const within = (x, low, high) => Math.min(Math.max(x, low), high);
 
 // Return a scene drawn on a canvas. `data` has parts, centre and radius; `draw(body, lines)` draws the moving parts at a
 // column-major 4 x 4 motion (null hides them) and polylines, flat arrays of x, y, z. A part with `hidden` is not drawn.
@@ -191,7 +192,7 @@ const makeScene = (canvas, data) => {
   const look = (name) => { [turn, tilt] = views[name]; };
   const orbit = (dx, dy) => { // movement of the pointer [px]
     turn -= dx / 150;
-    tilt = Math.min(Math.max(tilt + dy / 150, -1.55), 1.55);
+    tilt = within(tilt + dy / 150, -1.55, 1.55);
   };
   const zoom = (step) => { away = Math.min(Math.max(away * Math.exp(step / 600), data.radius), data.radius * 10); };
   setUp();

@@ -3,7 +3,7 @@
 //
 // `motion` describes what is shown: span() is its first and last frame; at(frame) its parameters, with null or NaN where
 // unknown; grade(frame, d) 0 inside the bound, 1 within the tolerance, 2 invalid, null unknown; behind(frame), optional,
-// a motion for comparison; keys(), optional, its keys. `act` receives seek(frame), and with keys choose(key), hold()
+// a motion for comparison; keys(), optional, its keys; step, optional, the frames of an arrow key. `act` receives seek(frame), and with keys choose(key), hold()
 // before a key is dragged, and move(key, frame, d), which returns the new key.
 const makeTimeline = (canvas, motion, act) => {
   const GUTTER = 36, EDGE = 10, RULER = 20, STRIP = 9, ROW = motion.keys ? 20 : 6, FOOT = 8;
@@ -218,8 +218,8 @@ const makeTimeline = (canvas, motion, act) => {
   }, { passive: false });
   canvas.addEventListener("dblclick", () => setView(motion.span()[0], motion.span()[1] - motion.span()[0]));
   canvas.addEventListener("keydown", (event) => {
-    const [first, last] = motion.span();
-    const to = { ArrowLeft: frame - 1, ArrowRight: frame + 1, Home: first, End: last }[event.key];
+    const [first, last] = motion.span(), step = motion.step ?? 1;
+    const to = { ArrowLeft: frame - step, ArrowRight: frame + step, Home: first, End: last }[event.key];
     if (to === undefined) return;
     event.preventDefault();
     act.seek(Math.max(Math.round(to), first));
