@@ -6,6 +6,7 @@ together in one value, except in the scalar formulas of the gauge.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -28,13 +29,14 @@ from jawusd.evaluator.gauge import (
     spline_input,
 )
 from jawusd.evaluator.kinds import ADDITIVE, ANCHORED, MODELS
-from jawusd.evaluator.models import AdditiveModel, AnchoredModel
+from jawusd.evaluator.models import AnchoredModel
 from jawusd.evaluator.operations import Rows, triple
 from jawusd.geometry.rodrigues import Triple
 from jawusd.geometry.so3 import hat
 from jawusd.rig.onnx_graph import Graph, Value
 
 _OPENING_TOLERANCE = 1e-10  # step of the opening, relative to 1 mm plus the opening, below which it has converged
+_STEP_MM = 1e-3  # step of finite differences [mm]
 # Maps 1, s, s^2, s^3 to themselves and their derivatives with respect to s.
 _POWERS = np.hstack([np.eye(4), np.diag([1.0, 2.0, 3.0], 1)])
 _HAT = hat(np.eye(3)).reshape(3, 9)  # maps rows (n, 3) to skew matrices (n, 9)
@@ -194,17 +196,16 @@ class AnchoredChart:
         return g.op("ReduceSum", passed, g.constant([1], np.int64), keepdims=0)
 
 
-class AdditiveChart:
-    """The jaw parameters d, which the curves map to twists."""
+class ParameterChart:
+    """The jaw parameters d of any kind of model; the derivatives are central differences."""
 
     def __init__(self, rig: JawRig) -> None:
-        self._model = AdditiveModel.from_arrays(rig.arrays)
-        self._tables = MODELS[ADDITIVE](flat_arrays(rig.arrays)).tables
-        self.point = np.zeros(3)
+        self._formula = MODELS[rig.kind](flat_arrays(rig.arrays))
+        self._starts, self.point = rig.model.starts, np.zeros(3)
 
     def start(self, g: Graph, u: Value) -> Value:
         """Return the grid points whose incisal displacement is nearest."""
-        starts = self._model.starts
+        starts = self._starts
         # |a - b|^2 without |b|^2, which is the same for all grid points
         squares = (starts.displacements**2).sum(axis=1)
         distance = u @ (-2.0 * starts.displacements.T) + g.constant(squares[None])
@@ -213,7 +214,29 @@ class AdditiveChart:
 
     def motion(self, g: Graph, x: Value) -> ChartMotion:
         """Return the motions at d = x (n, 3) [mm]."""
-        tables = stored(self._tables)
+        shifts = _STEP_MM * np.array([np.zeros(3), *np.eye(3), *-np.eye(3)])
+        around = triple(g.parts(g.reshape(g.reshape(x, [-1, 1, 3]) + g.constant(shifts[None]), [-1, 3]), 3))
+        found = self._formula.motion(around, stored(self._formula.tables), g)
+        entries = g.reshape(g.concat([*(entry for row in found.turn for entry in row), *found.t]), [-1, 7, 12])
+        turn, shift = np.split(np.eye(12), [9], axis=1)
+        at_x, ahead, behind = g.groups(entries, [1, 3, 3])
+        slopes = (ahead - behind) * (0.5 / _STEP_MM)
+        R = g.reshape(at_x @ turn + g.constant(np.eye(3).reshape(1, 1, 9)), [-1, 3, 3])
+        inverse = g.reshape(g.op("Transpose", R, perm=[0, 2, 1]), [-1, 1, 3, 3])
+        skew = g.reshape(g.op("MatMul", g.reshape(slopes @ turn, [-1, 3, 3, 3]), inverse), [-1, 3, 9])
+        return ChartMotion(R, at_x @ shift, skew @ (0.5 * _HAT.T), slopes @ shift)
+
+    def parameters(self, g: Graph, x: Value) -> Value:
+        """Return x."""
+        return x
+
+
+class AdditiveChart(ParameterChart):
+    """The jaw parameters d, which the curves map to twists."""
+
+    def motion(self, g: Graph, x: Value) -> ChartMotion:
+        """Return the motions at d = x (n, 3) [mm], with exact derivatives."""
+        tables = stored(self._formula.tables)
         curves = [curve_derivatives(f"curve{i}", d, tables, g) for i, d in enumerate(g.parts(x, 3), start=1)]
         (first,), (second,), (third,) = (value for value, _, _ in curves)
         omega, v = g.parts(first + second + third, 2)
@@ -226,12 +249,9 @@ class AdditiveChart:
         shift_x = g.op("MatMul", v_x, left) + along
         return ChartMotion(turning.rotation(g), g.op("MatMul", row, left), g.op("MatMul", omega_x, left), shift_x)
 
-    def parameters(self, g: Graph, x: Value) -> Value:
-        """Return x."""
-        return x
 
-
-CHARTS: dict[str, type[AnchoredChart] | type[AdditiveChart]] = {ANCHORED: AnchoredChart, ADDITIVE: AdditiveChart}
+#: Charts with exact derivatives, by kind; `ParameterChart` serves other kinds.
+CHARTS: dict[str, Callable[[JawRig], Chart]] = {ANCHORED: AnchoredChart, ADDITIVE: AdditiveChart}
 
 
 @dataclass(frozen=True)

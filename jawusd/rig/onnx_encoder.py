@@ -16,7 +16,7 @@ from jawusd.evaluator import JawRig
 from jawusd.evaluator.encoding import landmark_vectors
 from jawusd.evaluator.nearest import MIN_STIFFNESS
 from jawusd.geometry.se3 import se3_inverse
-from jawusd.rig.onnx_chart import CHARTS, Chart, loop_body, moved_vectors, zero_column
+from jawusd.rig.onnx_chart import CHARTS, Chart, ParameterChart, loop_body, moved_vectors, zero_column
 from jawusd.rig.onnx_graph import Graph, Value
 
 _GAUSS_NEWTON, _NEWTON = 12, 60  # maximum numbers of iterations
@@ -41,7 +41,7 @@ def add_encoder(g: Graph, rig: JawRig, pose: Value, d: str, residual: str) -> No
         residual: Name of the output: rms landmark distances (n,) [mm].
     """
     f = Graph(np.float64, "f_")
-    chart = CHARTS[rig.kind](rig)
+    chart = CHARTS.get(rig.kind, ParameterChart)(rig)
     at_rest = rig.T_anatomical_skull @ rig.T_rest
     vectors = at_rest @ landmark_vectors(rig.landmarks)
     flat = f.reshape(f.op("Cast", pose, to=TensorProto.DOUBLE), [-1, 16])

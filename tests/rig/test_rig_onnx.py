@@ -134,6 +134,15 @@ def test_encoder_inverts_the_decoder_of_other_rigs(name):
     assert residual.max() < 1e-9
 
 
+def test_kinds_without_a_chart_of_their_own_are_searched_by_differences(monkeypatch):
+    rig = example_rig("additive")
+    d = sample_valid(rig, 100, seed=14)
+    monkeypatch.setattr("jawusd.rig.onnx_encoder.CHARTS", {})
+    found, residual = search(rig, rig.pose(d), np.float64)
+    np.testing.assert_allclose(found, d, atol=1e-6)
+    assert residual.max() < 1e-6
+
+
 def test_one_pose_far_from_the_model_does_not_change_the_others(kind):
     """The second loop runs for all rows if one has not converged."""
     rig = example_rig(kind)
