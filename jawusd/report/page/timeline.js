@@ -3,8 +3,9 @@
 //
 // `motion` describes what is shown: span() is its first and last frame; at(frame) its parameters, with null or NaN where
 // unknown; grade(frame, d) 0 inside the bound, 1 within the tolerance, 2 invalid, null unknown; behind(frame), optional,
-// a motion for comparison; keys(), optional, its keys; step, optional, the frames of an arrow key. `act` receives seek(frame), and with keys choose(key), hold()
-// before a key is dragged, and move(key, frame, d), which returns the new key.
+// a motion for comparison; keys(), optional, its keys; step, optional, the frames of an arrow key. `act` receives
+// seek(frame), and with keys choose(key), hold() before a key is dragged, and move(key, frame, d), which returns the new
+// key.
 const makeTimeline = (canvas, motion, act) => {
   const GUTTER = 36, EDGE = 10, RULER = 20, STRIP = 9, ROW = motion.keys ? 20 : 6, FOOT = 8;
   const COLORS = ["--blue", "--vermilion", "--green"], GRADES = ["--green", "--orange", "--vermilion"];
