@@ -59,8 +59,8 @@ def offsets_by_clock(capture: Capture) -> tuple[dict[str, Offset], tuple[str, ..
             offset -= day if offset > 0 else -day  # time codes start again at midnight
         if offset >= clips[capture.reference].timeline.count or -offset >= clips[name].timeline.count:
             raise SyncError(
-                f"starts {abs(offset)} frames {'after' if offset > 0 else 'before'} camera {capture.reference} by its "
-                f"{capture.sync.method}: the clips do not overlap in time.",
+                f"according to its {capture.sync.method}, starts {abs(offset)} frames "
+                f"{'after' if offset > 0 else 'before'} camera {capture.reference}: the clips do not overlap in time.",
                 camera=name,
                 path=clips[name].path,
                 hint="Check that the clips belong to one take, synchronise by light flashes, or set [sync] offsets.",

@@ -65,7 +65,7 @@ class Flashes:
     """Light steps of one video."""
 
     steps: list[Step]  # light steps in temporal order
-    reason: str = ""  # reason why there are too few steps for synchronisation; empty if there are enough
+    reason: str = ""  # why there are too few brightness changes to synchronise; empty if there are enough
 
 
 def find_steps(brightness: Array, first_frame: int = 0) -> list[Step]:

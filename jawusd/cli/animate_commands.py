@@ -47,7 +47,7 @@ def _source_motion(loaded: JawRig, rig: Path, source: Path, prim: str | None) ->
 
 
 def _kept(loaded: JawRig, source: Path | None, motion: AuthoredMotion) -> tuple[AuthoredMotion, Changes]:
-    """Return the motion inside the bound, and the changes made; warn if a stage, FBX or glTF has no motion."""
+    """Return the motion moved inside the bound, and the changes; warn if a stage, FBX or glTF has no motion."""
     from jawusd.cli.motion import kept_inside
     from jawusd.cli.stage_commands import holds_stage, moved_mm, still_lines
 

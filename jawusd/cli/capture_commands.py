@@ -200,7 +200,7 @@ def scans(
     allow_outside: Outside = False,
     as_json: Json = False,
 ) -> None:
-    """Label crown and gum of both teeth scans, store the labels, and draw an image for review."""
+    """Label the crowns and gums in both dental scans, store the labels, and draw an image for review."""
     from jawusd.cli.text_capture import scans_lines
     from jawusd.pipeline.scans import label_scans
 

@@ -83,13 +83,13 @@ def jacobians(model: Array, d: Array, out: Array) -> None:
 
 @compiled("f8(f8[::1], f8, f8, f8)")
 def single_margin(bound: Array, d1: float, d2: float, d3: float) -> float:
-    """Return the margin [mm] of one d [mm]."""
+    """Return the signed distance [mm] from one d [mm] to the bound, positive inside."""
     return -signed_distance(bound, d1, d2, d3, hull_scratch(bound))[0]
 
 
 @compiled("void(f8[::1], f8[:,::1], f8[::1])")
 def margins(bound: Array, d: Array, out: Array) -> None:
-    """Write the margins (n,) [mm] of d (n, 3) [mm] to out."""
+    """Write the signed distances (n,) [mm] from d (n, 3) [mm] to the bound, positive inside, to out."""
     v = hull_scratch(bound)
     for row in range(len(d)):
         out[row] = np.nan
@@ -144,7 +144,7 @@ class CompiledKernels(NumpyKernels):
         return single_pose(self._packed_model, d1, d2, d3)
 
     def margin(self, d1: float, d2: float, d3: float) -> float:
-        """Return the margin [mm] of one d [mm]."""
+        """Return the signed distance [mm] from one d [mm] to the bound, positive inside."""
         return single_margin(self._packed_bound, d1, d2, d3)
 
     def poses(self, d: Array) -> Array:
@@ -166,7 +166,7 @@ class CompiledKernels(NumpyKernels):
         return out
 
     def margins(self, d: Array) -> Array:
-        """Return the margins (n,) [mm] of d (n, 3) [mm]."""
+        """Return the signed distances (n,) [mm] from d (n, 3) [mm] to the bound, positive inside."""
         out = np.empty(len(d))
         margins(self._packed_bound, _owned(d), out)
         return out

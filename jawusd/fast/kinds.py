@@ -114,7 +114,7 @@ def gauge_of(model: Array) -> GaugeNumbers:
 
 @device
 def displacement(model: Array, d1: float, d2: float, d3: float, by_d: Array) -> Vector:
-    """Return u [mm] of d [mm]; write du/dd to by_d (3, 3)."""
+    """Return the displacement u [mm] at d [mm]; write the Jacobian du/dd to by_d (3, 3)."""
     u, (x_1, y_1, y_2, y_3, z_1, z_2) = gauge.displacement(gauge_of(model), d1, d2, d3, FLOATS)
     by_d[0, 0], by_d[0, 1], by_d[0, 2] = x_1, 1.0, 0.0
     by_d[1, 0], by_d[1, 1], by_d[1, 2] = y_1, y_2, y_3

@@ -142,7 +142,7 @@ def _check_spread(Y: Array, sigma: Array) -> None:
 
 
 def _check_distances(names: tuple[str, ...], X: Array, Y: Array, sigma: Array, scale: bool, distance_mm: Array) -> None:
-    """Raise FittingError if the points contradict their standard deviations, or fit with left and right exchanged."""
+    """Raise FittingError if distances are too large for the standard deviations, or left and right seem exchanged."""
     listed = ", ".join(f"{name} {x:.1f}" for name, x in zip(names, distance_mm))
     sides = {"left": "right", "right": "left"}
     other = [re.sub("left|right", lambda side: sides[side[0]], name) for name in names]

@@ -19,7 +19,7 @@ class CameraSketch:
     video: PurePath | None = None
     masks: Mapping[str, PurePath] = field(default_factory=dict)  # paths of the masks by arch, "upper" and "lower"
     board: PurePath | None = None
-    remark: str = ""  # remark on the footage that becomes a comment
+    remark: str = ""  # remark on the footage, written as a comment
 
 
 @dataclass(frozen=True)

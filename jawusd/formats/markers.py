@@ -186,7 +186,7 @@ def _read_qtm(rows: _Rows, path: Path) -> MarkerTable:
     keys = {row[0].strip().upper(): [cell.strip() for cell in row[1:] if cell.strip()] for _, row in rows[:40]}
     included = "".join(keys.get("DATA_INCLUDED", ["3D"])[:1])
     if included != "3D" or "MARKER_NAMES" not in keys:
-        raise FormatError(f"has {included} data of Qualisys Track Manager, not markers.", path=path, hint=READ)
+        raise FormatError(f"contains {included} data from Qualisys Track Manager, not markers.", path=path, hint=READ)
     names = tuple(keys["MARKER_NAMES"])
     count = _whole(keys.get("NO_OF_MARKERS"), len(names), "NO_OF_MARKERS", path)
     if count != len(names):

@@ -31,7 +31,8 @@ class AlignedPhoto:
     misfit: float
     other_hand: float  # ratio of the misfits with the opposite and with the chosen handedness, at the initial pose [-]
     T_upper_lower_alone: Array  # bite estimated from this photograph alone, shape (4, 4)
-    alone_off_mm: float  # distance between own_bite and the common bite at the lower incisor
+    # distance between T_upper_lower_alone and the bite shared by all photographs, at the lower incisor
+    alone_off_mm: float
 
     def as_json(self) -> dict[str, object]:
         """Return the fields as plain data for JSON."""

@@ -150,7 +150,9 @@ def _content(path: Path, root: Path) -> str:
         parts += sorted(p for p in path.parent.iterdir() if p.suffix.startswith(".usd") and p != path)
     for part in parts:
         if not part.resolve().is_relative_to(root):
-            raise FormatError(f"{part.name} is a link out of the library; such links are not followed.", path=path)
+            raise FormatError(
+                f"{part.name} is a link that points outside the library; such links are not followed.", path=path
+            )
         if not part.is_file():
             raise FormatError(f"{part.name} is not a file.", path=path)
         total.update(part.name.encode() + b"\0")

@@ -140,7 +140,7 @@ def leave_one_out(donors: Sequence[Donor], *, closest: bool = False) -> Learned:
         closest: Whether to use only the subject with the most similar landmarks instead of an average.
 
     Raises:
-        FittingError: there are no donors.
+        FittingError: `donors` is empty.
     """
     if not donors:
         raise FittingError("the library has no subject whose motion can be transferred.")

@@ -29,7 +29,7 @@ _LISTED = 5
 # `tests/benchmarks/frozen.py` and 150 of its random clips; 10 % of 150 other clips without a fault are reported:
 # noise-free scenes at rest, and scenes whose noise is removed by strong compression.
 _MOST, _AROUND = 75, 48
-_FEWEST = 12  # minimum number of images from which the usual change is estimated
+_FEWEST = 12  # minimum number of images for estimating the typical change between consecutive images
 _LEAST_CHANGE = 0.1  # minimum change [of 255 levels] that counts as noise or motion
 # Maximum change, relative to the usual change, in a run of repeated images, and in a run of only one or two images.
 _SAME, _ALIKE = 0.05, 0.03

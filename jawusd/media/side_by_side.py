@@ -1,4 +1,4 @@
-"""Draw all cameras of a take in one image, each cropped to the teeth, with scans on top and a status bar below."""
+"""Draw all cameras of a take in one image, each cropped to the teeth, with overlaid scans and a status bar below."""
 
 from __future__ import annotations
 

@@ -209,7 +209,7 @@ def _histograms(
 
 
 def _nothing_to_draw(why: str) -> Figure:
-    """Return a figure that contains only an explanation."""
+    """Return a placeholder figure that only states why there is nothing to plot."""
     figure, (axis,) = new_figure(11.0, 1.0, 1, 1)
     axis.set_axis_off()
     axis.text(0.5, 0.5, why, ha="center", va="center")

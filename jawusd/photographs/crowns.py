@@ -18,7 +18,8 @@ from jawusd.tracking.contour.scan import Faces, Scan
 
 _FEWEST_FACES = 50  # minimum number of faces of a tooth; smaller pieces are scanning artefacts
 _MOST_TEETH = 120  # maximum number of separate teeth per arch, since the labels of both arches are stored in one byte
-# Substitute wall for missing gum: number of segments, start as a fraction of the crown height [-], height [mm].
+# Strip of faces added where the scan has no gum: number of segments, start as a fraction of the crown height [-], and
+# height [mm].
 _WALL_PARTS, _WALL_FROM, _WALL_MM = 24, 0.75, 15.0
 _SMOOTH_PX = 2.0  # standard deviation of the Gaussian that averages the direction of an outline
 
@@ -88,7 +89,7 @@ def split_teeth(scan: Scan, T_anatomical_scan: Array, arch: int) -> Crowns:
 
 
 def _with_wall(scan: Scan, T_anatomical_scan: Array, to_gum: Array) -> Scan:
-    """Return the scan with a substitute gum wall along the middle of its arch."""
+    """Return the scan with a strip of faces in place of the gum along the middle of its arch."""
     points = scan.crown_vertices()
     flat = transform_points(T_anatomical_scan, points)
     # The teeth are ordered by their angle as seen from inside the arch.

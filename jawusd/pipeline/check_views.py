@@ -207,7 +207,9 @@ def _pixels(
     source: str,
     camera: str,
 ) -> tuple[Array, Array]:
-    """Return the pixels of the masks of `source`, by arch, at a frame of the reference camera, taken for `camera`.
+    """Return the mask pixels of camera `source` at one frame, by arch, as if they were the masks of `camera`.
+
+    `instant` is the frame number of the reference camera.
 
     `numbered` is 0 if the masks are numbered by the frames of `camera`, and 1 if by the frames of `source`.
     """

@@ -20,7 +20,7 @@ BODIES = ("head", "jaw")
 LENGTH_UNITS_MM = {"mm": 1.0, "cm": 10.0, "m": 1000.0}
 _MOST_C3D_FRAMES = 65_535  # maximum value of C3D's 16-bit frame counter
 _BLOCK, _C3D_KEY = 512, 0x50
-#: Byte order, and offset within the header of the byte with the sign of the scale, for Intel, DEC and MIPS processors.
+#: Byte order, and header offset of the byte that holds the scale's sign, for Intel, DEC and MIPS processors.
 _BYTE_ORDERS = {b"T": ("<", 15), b"U": ("<", 13), b"V": (">", 12)}
 _LABELS = ("LABELS", *(f"LABELS{k}" for k in range(2, 9)))  # C3D parameters that contain up to 255 labels each
 

@@ -235,8 +235,8 @@ def picked_start(picked_frame: int, frames: range, begin: Callable[[], tuple[T, 
     pose, fit = begin()
     if fit < least_fit:
         raise TrackingError(
-            f"the picks do not match the images: {fit:.0%} of the visible contour fits the colours; at least "
-            f"{least_fit:.0%} is needed",
+            f"the picks do not match the images: {fit:.0%} of the visible contour agrees with the image "
+            f"colours; at least {least_fit:.0%} is needed",
             frame=picked_frame,
             hint="Check the picks, and that scans, rig and calibration belong to this subject and these cameras.",
         )

@@ -36,7 +36,7 @@ def check_page(path: str | os.PathLike[str]) -> None:
     import jawusd.report.solve_page  # noqa: F401
 
     if Path(path).suffix.lower() != PAGE:
-        raise OutputError("a report is an HTML page.", path=path, hint=f"Name a file ending in {PAGE}.")
+        raise OutputError("the report must be an HTML file.", path=path, hint=f"Name a file ending in {PAGE}.")
 
 
 def report_solve(

@@ -39,9 +39,11 @@ class SegmentationConfig:
     working_px_per_mm: float = 7.2
     # Margin around the projected crowns [mm], which includes lips, gum and tongue, but no background.
     margin_mm: float = 4.0
-    # Minimum depth inside the projected crowns of pixels that train the tooth colours [mm]; larger than the pose error.
+    # Minimum distance of training pixels of the tooth colours from the outline of the projected crowns, towards the
+    # inside [mm]; larger than the pose error.
     inner_mm: float = 0.4
-    # Minimum distance outside the projected crowns of pixels that train the colours of the surroundings [mm].
+    # Minimum distance of training pixels of the surrounding colours from the outline of the projected crowns, towards
+    # the outside [mm].
     outer_mm: float = 1.0
     # Maximum distance of tooth pixels outside the projected crowns [mm], in the first iteration and after alignment.
     reach_mm: tuple[float, ...] = (1.6, 1.0)
@@ -222,7 +224,7 @@ def _logistic(odds: Array) -> Array:
 
 
 class ColourStates:
-    """Files with the colours of all cameras."""
+    """Files that hold the colour models of all cameras."""
 
     def __init__(self, folder: Path, colours: Mapping[str, ColourModel]) -> None:
         """Store the folder of the files, and the colours by camera."""

@@ -141,7 +141,7 @@ class Page:
         self.refresh()
 
     def refresh(self) -> None:
-        """Update everything from the session."""
+        """Refresh all widgets from the session state."""
         session = self.session
         readout = session.readout()
         with self.client.atomic():

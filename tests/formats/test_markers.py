@@ -221,7 +221,7 @@ def test_frames_that_a_table_leaves_out_show_no_markers(tmp_path):
         ("a.trc", trc(cells(), unit="inch"), 'lengths are in "inch"; the unit must be one of mm, cm, m'),
         ("a.trc", trc(cells(), frames=[1, 2, 2, 3, 4, 5]), "must be increasing whole numbers"),
         ("a.tsv", qtm(cells()).replace("\t4\n", "\t5\n", 1), "declares 5 markers but names 4"),
-        ("a.tsv", qtm(cells()).replace("DATA_INCLUDED\t3D", "DATA_INCLUDED\t6D"), "has 6D data of Qualisys"),
+        ("a.tsv", qtm(cells()).replace("DATA_INCLUDED\t3D", "DATA_INCLUDED\t6D"), "contains 6D data from Qualisys"),
         ("a.csv", vicon(cells(), outputs=True).replace("Trajectories", "Joints"), "Model Outputs, Joints, Devices"),
         ("a.csv", vicon(cells()).replace("X,Y,Z", "RX,RY,RZ"), "has no markers"),
         ("a.csv", "Format Version,1.23,Take Name,t\n\n,Type,Marker\n", "OptiTrack Motive, not a supported marker"),

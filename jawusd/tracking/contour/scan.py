@@ -31,7 +31,7 @@ _PROBES = 300  # number of vertices at which motion is measured: enough for mean
 # run time is proportional to the number of faces, and the loss of accuracy is below 0.002 mm.
 _DENSE_FACES, _THIN_FACES = 60_000, 20_000
 _GUM_SHARE = 0.02  # ratio of gum to crown faces below which gum faces are remnants of removed gum
-_FEWEST_CROWN_FACES = 100  # minimum number of crown faces: fewer faces lack a contour in some directions
+_FEWEST_CROWN_FACES = 100  # minimum number of crown faces; with fewer, some viewing directions have no contour
 
 
 @dataclass(frozen=True, eq=False)

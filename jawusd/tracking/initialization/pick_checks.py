@@ -114,7 +114,7 @@ class _Evidence:
 
 
 def _evidence(setting: Setting, seen: Sequence[Seen], masked: Sequence[str]) -> _Evidence:
-    """Estimate poses from the picks of a setting, and measure how well the masks of `masked` cameras agree.
+    """Estimate poses from the picks in `setting`, and measure how well the masks of `masked` cameras agree.
 
     `seen` reads the masks for each candidate set of time offsets; for each camera, the best candidate is used.
 

@@ -25,8 +25,8 @@ _PX_PER_MM = 2.0
 _FINALISTS = 5  # number of poses per arch that are refined
 _DISTINCT_MM = 2.0  # minimum distance of distinct poses [mm]: closer ones converge to the same local minimum
 # Rotations and translations around a guess in which the teeth face the cameras with the upper arch above the lower one.
-# Lateral movements and lips bias mostly the roll of the guess. With retracted lips, the centre of the masks lies up to
-# 20 mm behind the front teeth.
+# Lateral movement and the lips mainly bias the roll of the guess. With retracted lips, the centre of the masks lies up
+# to 20 mm behind the front teeth.
 _GRID = Grid(
     yaw_rad=np.radians(np.arange(-50, 51, 10.0)),
     pitch_rad=np.radians(np.arange(-40, 41, 10.0)),

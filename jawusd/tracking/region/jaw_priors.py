@@ -18,9 +18,9 @@ from jawusd.tracking.contour.equations import NormalEquations, Solution, transla
 from jawusd.tracking.contour.quality import landmark_sigmas
 
 _UNIT_MM = (5.0, 20.0, 5.0)  # scale of the incisal point's motion to the left, upwards and forwards [mm]
-# Mean motion of the left condyle to the left, upwards and forwards [mm]: coefficients of 1, x, y, z, xx, xy, xz, yy,
-# yz, zz, over 60 joints of `jawusd.synthetic.person`, whose ranges come from the literature. The motion of the right
-# condyle is the mirror image.
+# Mean motion of the left condyle to the left, upwards and forwards [mm], as a quadratic in the incisal point's motion
+# x, y, z, in units of `_UNIT_MM` (coefficients of 1, x, y, z, xx, xy, xz, yy, yz, zz). It is averaged over 60 simulated
+# joints of `jawusd.synthetic.person`, whose ranges come from the literature. The right condyle moves as a mirror image.
 _USUAL_MM = np.array(
     [
         [0.0, 1.1, 0.0, 0.0, 0.0, 0.2, -0.4, 0.0, 0.0, 0.0],

@@ -48,9 +48,10 @@ _SHIFTS_MM = [
     *((0.0, far, 0.0) for far in _FAR_MM),
 ]
 
-# Residual gates of an alignment from the prediction, from farther away, of a trial, and of the final step with all
-# faces [px]; spacing of contour samples [px]; and image motion after which scans are rendered again [px].
+# Residual gates of an alignment that starts from the prediction, and of one that starts from a more distant pose [px].
 _NEAR_GATES_PX, _FAR_GATES_PX = (6.0, 4.0, 3.0, 2.5, 2.0), (12.0, 8.0, 6.0, 4.0, 3.0, 2.5, 2.0)
+# Residual gates of the short trial alignments of a search [px]. Residual gate of the final step, which uses all faces
+# of the scans [px]. Spacing of contour samples [px]. Image motion after which the scans are rendered again [px].
 _TRIAL_GATES_PX, _LAST_GATES_PX, _SAMPLE_STEP_PX, _REDRAW_PX = (8.0, 6.0), (2.0,), 2.0, 2.0
 _FACES = 6_000  # number of crown faces of the scans before the final step
 # Border variance times correlation length that sets the weight of the condylar prior [px^3]: for a clearly visible jaw,
@@ -163,7 +164,7 @@ class PoseSearch:
         return solution
 
     def from_farther(self, solution: Solution, start: Array, last: Array, look: InstantViews) -> Solution:
-        """Align from a start with wide residual gates, and from the previous poses; return the better solution."""
+        """Align from a start pose, using wide residual gates, and from the last poses; return the better solution."""
         solution = self._better(solution, self._align(start, look, _FAR_GATES_PX))
         return self._better(solution, self._align(last, look, _NEAR_GATES_PX))
 
