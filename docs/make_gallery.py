@@ -199,7 +199,7 @@ def pose_page(out: Path, folder: Path) -> Path:
     with tempfile.TemporaryDirectory() as made, browser_page((1440, 900)) as page:
         write_page(out, Path(made) / "jaw.html")
         page.goto((Path(made) / "jaw.html").as_uri())
-        page.wait_for_function("document.getElementById('jaw').dataset.clearance !== undefined")
+        page.wait_for_selector("#jaw[data-clearance]", state="attached")  # scripts of the page must not use eval
         timeline = page.locator('[data-jaw="timeline"]')
         area, box = json.loads(timeline.get_attribute("data-area")), timeline.bounding_box()
         for share, d in KEYS_SHOWN:
