@@ -1,7 +1,7 @@
 // A timeline on a canvas: frames, a strip of verdicts, keys, and curves of d1 to d3 [mm]. A drag scrubs, the wheel or
 // two fingers zoom, and a double click shows everything.
 //
-// `motion` describes what is shown: span() is its first and last frame; at(frame) its parameters, with null or NaN where
+// `motion` describes what is shown: span() is its first and last frame; at(frame) its parameters, null or not finite where
 // unknown; grade(frame, d) 0 inside the bound, 1 within the tolerance, 2 invalid, null unknown; behind(frame), optional,
 // a motion for comparison; keys(), optional, its keys; step, optional, the frames of an arrow key. `act` receives
 // seek(frame), and with keys choose(key), hold() before a key is dragged, and move(key, frame, d), which returns the new
