@@ -101,7 +101,7 @@ def test_what_most_pictures_hold_counts(tmp_path):
     assert [k for k in range(COUNT) if found[k] is None] == [2, 3, 4, 5, 6, 7]
     expected = [
         "002.png reaches only 100, but teeth are 255",
-        "003.png has",
+        "003.png shows",
         "004.png is uniformly 255",
         "005.png is not a mask",
     ]
