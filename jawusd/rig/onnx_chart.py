@@ -36,7 +36,9 @@ from jawusd.geometry.so3 import hat
 from jawusd.rig.onnx_graph import Graph, Value
 
 _OPENING_TOLERANCE = 1e-10  # step of the opening, relative to 1 mm plus the opening, below which it has converged
-_STEP_MM = 1e-3  # step of finite differences [mm]
+#: Step of finite differences, and displacements of a point for central differences: none, ahead, behind [mm].
+STEP_MM = 1e-3
+SHIFTS_MM = STEP_MM * np.array([np.zeros(3), *np.eye(3), *-np.eye(3)])
 # Maps 1, s, s^2, s^3 to themselves and their derivatives with respect to s.
 _POWERS = np.hstack([np.eye(4), np.diag([1.0, 2.0, 3.0], 1)])
 _HAT = hat(np.eye(3)).reshape(3, 9)  # maps rows (n, 3) to skew matrices (n, 9)
@@ -214,13 +216,12 @@ class ParameterChart:
 
     def motion(self, g: Graph, x: Value) -> ChartMotion:
         """Return the motions at d = x (n, 3) [mm]."""
-        shifts = _STEP_MM * np.array([np.zeros(3), *np.eye(3), *-np.eye(3)])
-        around = triple(g.parts(g.reshape(g.reshape(x, [-1, 1, 3]) + g.constant(shifts[None]), [-1, 3]), 3))
+        around = triple(g.parts(g.reshape(g.reshape(x, [-1, 1, 3]) + g.constant(SHIFTS_MM[None]), [-1, 3]), 3))
         found = self._formula.motion(around, stored(self._formula.tables), g)
         entries = g.reshape(g.concat([*(entry for row in found.turn for entry in row), *found.t]), [-1, 7, 12])
         turn, shift = np.split(np.eye(12), [9], axis=1)
         at_x, ahead, behind = g.groups(entries, [1, 3, 3])
-        slopes = (ahead - behind) * (0.5 / _STEP_MM)
+        slopes = (ahead - behind) * (0.5 / STEP_MM)
         R = g.reshape(at_x @ turn + g.constant(np.eye(3).reshape(1, 1, 9)), [-1, 3, 3])
         inverse = g.reshape(g.op("Transpose", R, perm=[0, 2, 1]), [-1, 1, 3, 3])
         skew = g.reshape(g.op("MatMul", g.reshape(slopes @ turn, [-1, 3, 3, 3]), inverse), [-1, 3, 9])

@@ -16,11 +16,19 @@ from jawusd.evaluator import JawRig
 from jawusd.evaluator.encoding import landmark_vectors
 from jawusd.evaluator.nearest import MIN_STIFFNESS
 from jawusd.geometry.se3 import se3_inverse
-from jawusd.rig.onnx_chart import CHARTS, Chart, ParameterChart, loop_body, moved_vectors, zero_column
+from jawusd.rig.onnx_chart import (
+    CHARTS,
+    SHIFTS_MM,
+    STEP_MM,
+    Chart,
+    ParameterChart,
+    loop_body,
+    moved_vectors,
+    zero_column,
+)
 from jawusd.rig.onnx_graph import Graph, Value
 
 _GAUSS_NEWTON, _NEWTON = 12, 60  # maximum numbers of iterations
-_STEP_MM = 1e-3  # step of the finite differences of the gradient in Newton's method [mm]
 # Step length below which a row has converged. The loop ends when all rows have converged; their last steps are taken
 # without another evaluation of the model.
 _CONVERGED_MM = 1e-6
@@ -156,13 +164,12 @@ def _curved(g: Graph, chart: Chart, vectors: Array, x: Value, target: Value) -> 
 
     The Hessian is the central difference of the gradient.
     """
-    shifts = _STEP_MM * np.array([np.zeros(3), *np.eye(3), *-np.eye(3)])
-    around = g.reshape(g.reshape(x, [-1, 1, 3]) + g.constant(shifts[None]), [-1, 3])
+    around = g.reshape(g.reshape(x, [-1, 1, 3]) + g.constant(SHIFTS_MM[None]), [-1, 3])
     targets = g.reshape(g.reshape(target, [-1, 1, 12]) + g.constant(np.zeros((1, 7, 12))), [-1, 12])
     measured = g.reshape(_measured(g, chart, vectors, around, targets), [-1, 112])
     place = np.eye(112).reshape(7, 16, 112)
     slopes = place[:, _SLOPE]
-    half = (slopes[1:4] - slopes[4:]) / (4.0 * _STEP_MM)
+    half = (slopes[1:4] - slopes[4:]) / (4.0 * STEP_MM)
     curved = np.array(place[0])
     curved[_MATRIX] = (half + half.swapaxes(0, 1)).reshape(9, 112)
     newton, plain = measured @ curved.T, measured @ place[0].T
