@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from jawusd.pipeline.track import FrameTrackSummary, TrackSummary
 
 
-_MOST_TODO = 3  # maximum number of further recommendations that a build prints; the report lists all
+_MOST_FURTHER = 3  # maximum number of further recommendations that a build prints; the report lists all
 
 
 def build_lines(summary: BuildSummary, verbose: bool = False) -> list[str]:
@@ -41,7 +41,7 @@ def _verdict_lines(report: ReportSummary, verbose: bool) -> list[str]:
         return ["No verdict, because there is no report."]
     verdict = report["verdict"]
     also = verdict.get("todo", [])[1:]
-    listed = also if verbose else also[:_MOST_TODO]
+    listed = also if verbose else also[:_MOST_FURTHER]
     more = [f"  and {len(also) - len(listed)} more in the report"] if len(also) > len(listed) else []
     reasons = [f"  because {one}" for one in verdict["because"]] if verbose else []
     return [verdict_sentence(verdict), *(f"  also: {one}" for one in listed), *more, *reasons]

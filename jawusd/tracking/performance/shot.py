@@ -24,7 +24,7 @@ from jawusd.tracking.follow import Begin, TwoWays
 from jawusd.tracking.initialization.footage import Footage
 from jawusd.tracking.initialization.scan_checks import check_occlusion
 from jawusd.tracking.initialization.start import find_start
-from jawusd.tracking.performance.attempts import Attempts, FrameFit
+from jawusd.tracking.performance.attempts import Attempts, FrameFit, usual_residual_px
 from jawusd.tracking.performance.coordinates import Coordinates, Pose
 from jawusd.tracking.performance.forward import ForwardPass
 from jawusd.tracking.performance.instant import InstantSolver, quick, whole
@@ -123,12 +123,17 @@ class _Take:
                 hint="Check that the rig is of this subject, and check the masks and calibration at this frame.",
             )
         take = TwoWays(range(first, stop), self._places, lambda fit: fit.objective_px, progress=self._progress)
-        take.follow(Begin(start, begun, self._walk))
         self.fits = take.known
+        take.follow(Begin(start, begun, self._walk))
 
     def _walk(self, way: range, near: FrameFit) -> Iterator[FrameFit]:
-        """Yield the fits of frames in tracking order, next to a given fit."""
-        passing = ForwardPass(Attempts(self._quick, self._weight), near, fixed_head=self._shot.fixed_head)
+        """Yield the fits of frames in tracking order, next to a given fit.
+
+        If frames are followed again, their residuals are compared with those of all frames followed so far.
+        """
+        again = any(frame in self.fits for frame in way)
+        usual_px = usual_residual_px(self.fits.values()) if again else None
+        passing = ForwardPass(Attempts(self._quick, self._weight, usual_px), near, fixed_head=self._shot.fixed_head)
         for frame in way:
             yield passing.step(self._views.at(frame))
 
