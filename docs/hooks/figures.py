@@ -118,7 +118,7 @@ def crown(x, top, width, height, up):
 
 
 def masks():
-    """Draw what masks of both rows hold: crowns, from the gum line to the free edges, behind the lips or not."""
+    """Draw what masks of both rows hold: crowns, from the gum line to the tooth edges, behind the lips or not."""
     parts = []
     for side, label in ((0, "the picture"), (350, "its two masks")):
         for row in range(2):
@@ -132,7 +132,7 @@ def masks():
                 kind = "soft" if not side else "area"
                 parts.append(path(crown(x, gum_line, width, height, up=row == 0), kind, closed=True))
         parts.append(text(side + 163, 250, label))
-    parts += [text(338, 66, "gum line", "middle", "small"), text(338, 138, "free edges", "middle", "small")]
+    parts += [text(338, 66, "gum line", "middle", "small"), text(338, 138, "tooth edges", "middle", "small")]
     parts += [arrow((308, 68), (276, 72)), arrow((372, 68), (400, 72)), arrow((300, 134), (276, 122))]
     parts += [text(513, 40, "upper", "middle", "small"), text(513, 222, "lower", "middle", "small")]
     return svg(680, 264, "Crowns in the picture, and the masks of the upper and the lower row", parts)

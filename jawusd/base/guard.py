@@ -244,7 +244,7 @@ def _run_in_subprocess() -> NoReturn:
     """Run the program in a second Python process and exit with its status, on systems without fork."""
     import subprocess
 
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the console interrupts both processes
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl+C in the console reaches both processes
     line = [sys.executable, "-m", "jawusd", *sys.argv[1:]]
     code = subprocess.run(line, env={**os.environ, _CHILD: "1"}, check=False).returncode
     if code < 0 or code >= 0xC0000000:  # Windows exit codes of uncaught exceptions

@@ -96,7 +96,7 @@ class FoundLens:
 
 
 def find_lenses(folder: Path, scripts: Mapping[Path, list[NukeNode]]) -> list[FoundLens]:
-    """Return the lenses in Nuke scripts (nodes by file) and in the text files of a folder."""
+    """Return the lens models found in Nuke scripts (node lists keyed by file) and in the text files of a folder."""
     out = []
     for script, nodes in scripts.items():
         for node in nodes:

@@ -62,7 +62,7 @@ GROUPS = {
         "info": "Describe a rig file or tracks.",
         "report": "Write the report of a build or a solve again.",
         "validate": "Check a rig, or poses against a rig.",
-        "pose": "Print the jaw pose of parameters d.",
+        "pose": "Print the jaw pose at parameters d.",
         "encode": "Convert poses to the nearest parameters d.",
         "ik": "Find the d that move a point to a target.",
     },

@@ -148,7 +148,7 @@ def pose(
     allow: Allow = None,
     as_json: Json = False,
 ) -> None:
-    """Print the jaw pose of parameters d: 4x4 matrix, twist, landmarks, tooth clearance, and margin to the bound."""
+    """Print the jaw pose at parameters d: 4x4 matrix, twist, landmarks, tooth clearance, and margin to the bound."""
     import jawusd
     from jawusd.evaluator import Reason
     from jawusd.geometry import LANDMARKS, transform_points

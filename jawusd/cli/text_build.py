@@ -173,7 +173,7 @@ def track_lines(summary: TrackSummary) -> list[str]:
 def _take_lines(summary: TrackSummary) -> list[str]:
     """Return the estimates from the whole take as text: offsets of outlines, and the registration of the scans."""
     lines = []
-    reaches = (("free edges", summary.get("outline_bias_px")), ("gum line", summary.get("gum_bias_px")))
+    reaches = (("tooth edges", summary.get("outline_bias_px")), ("gum line", summary.get("gum_bias_px")))
     for what, found in reaches:
         if found is not None:
             reach = ", ".join(f"{name} {upper:+.2f} {lower:+.2f}" for name, (upper, lower) in found.items())

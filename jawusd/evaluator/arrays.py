@@ -224,7 +224,8 @@ def _check_values(arrays: dict[str, Array], specs: Mapping[str, ArraySpec]) -> N
         defect = float(rigidity_defect(arrays[name]))
         if defect > _RIGID_TOLERANCE:
             raise EvaluatorError(
-                f'"{name}" is not rigid: its defect is {defect:.2g}; the maximum is {_RIGID_TOLERANCE:g}.'
+                f'"{name}" is not rigid: its deviation from a rigid transform is {defect:.2g}; '
+                f"the maximum is {_RIGID_TOLERANCE:g}."
             )
     for name, spec in specs.items():
         if spec.values == "positive" and not (arrays[name] > 0).all():

@@ -181,7 +181,7 @@ def _inverse(matrix: Symmetric) -> tuple[Vector, Vector, Vector]:
     """Return the rows of the inverse of a definite symmetric matrix, by cofactors."""
     a, p, q, c, s, f = matrix
     x, y, z = c * f - s * s, q * s - p * f, p * s - q * c
-    # keeps the result finite for a singular matrix; damping corrects the step
+    # keeps the result finite for a singular matrix; if the step is then wrong, damping is increased
     scale = 1.0 / ((a * x + p * y + q * z) or 1.0)
     x, y, z = x * scale, y * scale, z * scale
     v, w = (p * q - a * s) * scale, (a * c - p * p) * scale

@@ -15,7 +15,7 @@ class ArraySpec(NamedTuple):
         attribute: USD attribute, with the values in row-major order; None for `d_range` (see `D_RANGE_ATTRIBUTES`).
         shape: Axis lengths; axes of the same name have the same length.
         integer: Whether the values are integers in USD; in memory all arrays are float64.
-        values: Required values: "positive", or "rising" for at least two increasing ones; None for any.
+        values: Constraint on the values: "positive", "rising" (two or more, strictly increasing), or None.
     """
 
     attribute: str | None

@@ -135,20 +135,20 @@ class BoundedSearch:
 
 
 class _Scan:
-    """Points spread over the valid volume, slice by slice, and their motions.
+    """Points spread over the valid volume, slice by slice, and the rigid motion at each.
 
     Attributes:
         points: d of the points [mm], shape (p, 3), in order of d1.
     """
 
     def __init__(self, points: Array, R: Array, t: Array) -> None:
-        """Store the points and their motions R (p, 3, 3), t (p, 3) [mm]."""
+        """Store the points and the rigid motion at each: R (p, 3, 3), t (p, 3) [mm]."""
         self.points, self._lengths = points, _squared_lengths(points)
         self._motions = np.concatenate([R, t[:, :, None]], axis=2).reshape(-1, 4)
         self._first = np.flatnonzero(np.diff(points[:, 0], prepend=-np.inf) > 0)
 
     def images(self, vectors: Array) -> Array:
-        """Return the images (p, 3, m) of homogeneous vectors (4, m) [mm] under the motions."""
+        """Apply the motions to homogeneous vectors (4, m) [mm]; return an array of shape (p, 3, m)."""
         return (self._motions @ vectors).reshape(len(self.points), 3, vectors.shape[1])
 
     def valleys(self, features: Array, wanted: Array) -> tuple[Indices, Array]:

@@ -180,7 +180,7 @@ def load_skin(path: str | os.PathLike[str]) -> Skin:
     try:
         return Skin(arrays, meta)
     except EvaluatorError as error:
-        raise FormatError(error.message, path=path, hint="Learn it again with `jawusd skin-fit`.") from error
+        raise FormatError(error.message, path=path, hint="Fit the skin again with `jawusd skin-fit`.") from error
 
 
 def _checked(arrays: Mapping[str, Array]) -> dict[str, Array]:

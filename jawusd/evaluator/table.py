@@ -40,7 +40,9 @@ class SampledTable:
         twists = np.asarray(twists, dtype=np.float64)
         counts = tuple(len(axis) for axis in self.grid_axes)
         if twists.shape != (*counts, 6) or self.T_rest.shape != (4, 4):
-            raise ValueError(f"twists must have shape {(*counts, 6)} and T_rest (4, 4), got {twists.shape}")
+            raise ValueError(
+                f"twists must have shape {(*counts, 6)} and T_rest (4, 4), got {twists.shape} and {self.T_rest.shape}"
+            )
         if len(counts) != 3 or any(len(axis) < 2 or (np.diff(axis) <= 0).any() for axis in self.grid_axes):
             raise ValueError("grid_axes must be three increasing arrays of at least two positions")
         # stores neighbours along d3 side by side, for half as many memory accesses

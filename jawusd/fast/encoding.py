@@ -244,7 +244,7 @@ def _nearest_start(model: Array, x: Array) -> None:
 
 @device
 def _residual_mm(vectors: Array, e: Encoding) -> float:
-    """Return the distance [mm] between the images of the vectors under the motion in e.w and their targets."""
+    """Return the distance [mm] between the vectors, moved by the motion in e.w, and their targets."""
     total = 0.0
     for i in range(3):
         for j in range(4):

@@ -21,10 +21,10 @@ _OUTLIER = 2.8
 _ROUNDS = 100
 _SETTLED = 1e-9  # change of weights at which the iteration ends
 # Largest median distance of the points after the fit, in standard deviations: at most 2.2 in ten markings of each of 20
-# synthetic heads; 18 and more with the unit wrong by a factor of 10.
+# synthetic heads; at least 18 with the unit wrong by a factor of 10.
 _LARGEST_MEDIAN = 4.0
-# Minimum decrease of the sum of squares for left and right to count as exchanged: found in all of the same 200 markings
-# if exchanged, and in none if not.
+# Minimum decrease of the sum of squares for left and right to count as exchanged: reached in all of the same 200
+# markings if exchanged, and in none if not.
 _EXCHANGED = 20.0
 # Smallest distance of the points from a line, relative to their standard deviation there: the rotation about the line
 # is then uncertain by 20 degrees.
@@ -58,7 +58,7 @@ def align(
 
     The rigid motion, or the similarity, minimises the sum of weighted squared distances (Umeyama 1991). Points beyond
     2.8 standard deviations count less (Huber's weights, iterated). The covariance follows from the standard deviations,
-    and is enlarged if the points scatter more than these state.
+    and is enlarged if the points scatter more than these suggest.
 
     Args:
         points_model: Points of the face model by name, its own frame and unit, each (3,).
@@ -73,7 +73,7 @@ def align(
 
     Raises:
         FittingError: fewer than three points, points on a line, points that the rig does not provide, points that
-            contradict their standard deviations, or left and right exchanged.
+            scatter far more than their standard deviations, or left and right exchanged.
         ValueError: a point or standard deviation that is not finite, or a standard deviation or unit not above 0.
     """
     names = tuple(points_model)
@@ -135,8 +135,8 @@ def _check_spread(Y: Array, sigma: Array) -> None:
     across = float(np.linalg.svd(centred, compute_uv=False)[1])
     if across < _LEAST_SPREAD:
         raise FittingError(
-            f"the points lie nearly on a line: only {across:.1f} standard deviations beside it, at least "
-            f"{_LEAST_SPREAD:g} are needed. The rotation about this line is undetermined.",
+            f"the points lie nearly on a line: their distance from it is only {across:.1f} standard deviations; "
+            f"at least {_LEAST_SPREAD:g} are needed. The rotation about this line is undetermined.",
             hint="Add a point away from the line, such as the chin, or one on the other side of the face.",
         )
 

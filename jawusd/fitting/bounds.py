@@ -100,8 +100,8 @@ def fit_slice_hull(d: Array, closed_mm: float | None = None) -> tuple[dict[str, 
     Returns:
         The `slice_*` arrays of a model; and its `tolerance_mm` and `held_out_*` arrays. The tolerance for measured
         poses is the 95 % quantile of the distance of held-out frames outside the hull, since other exercises reach
-        slightly farther than those captured, but at most 1 mm, since a larger tolerance would accept poses that no
-        frame shows.
+        slightly farther than those captured. It is at most 1 mm, since a larger one would accept poses that no frame
+        shows.
     """
     blocks = np.arange(len(d)) // min(_BLOCK, max(1, len(d) // _FOLDS)) % _FOLDS
     excess = [

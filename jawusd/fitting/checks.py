@@ -39,7 +39,7 @@ _HALF_OPEN_SHARE = 0.35  # minimum fraction of the full range that should be rea
 # the median (as a fraction of the range) beyond which a frame covers its direction, and minimum number of directions to
 # be covered.
 _SECTORS, _SECTOR_REACH, _FEWEST_SECTORS = 8, 0.25, 6
-#: Distance per parameter from all captured poses beyond which a point of the bound lies in a gap [mm].
+#: Distances along d1, d2 and d3 [mm]; a point of the bound farther from every captured pose lies in a gap.
 FAR_MM = np.array([3.0, 2.0, 2.0])
 _MOST_GAPS = 0.15  # maximum fraction of the bound in gaps; beyond it, more should be recorded
 # Ranges (1st to 99th percentile) below which a parameter counts as not excited [mm].

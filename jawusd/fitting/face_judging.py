@@ -16,7 +16,7 @@ from jawusd.formats.atomic import write_text_atomic
 from jawusd.formats.face_track import read_jaw_track
 from jawusd.geometry import se3_inverse, transform_points
 
-# Standard deviations of the alignment's error by which thresholds are widened.
+# Number of standard deviations of the alignment error by which thresholds are widened.
 _WIDENED = 2.0
 
 
@@ -72,10 +72,10 @@ def judge_jaw_track(
 
 
 def alignment_error_mm(rig: JawRig, T_skull_mandible: Array, alignment: Alignment) -> Array:
-    """Return the rms displacement (F,) [mm] of the landmarks in poses (F, 4, 4) by the error of an alignment.
+    """Return the rms displacement (F,) [mm] that an alignment error causes at the landmarks, for poses (F, 4, 4).
 
     The motion D = T T_rest^-1 becomes A D A^-1, where A is the error. To first order, a landmark p is displaced by
-    J(D p) xi - R_D J(p) xi, with J of `motion_of_points` and xi the error. The closed bite is not displaced.
+    J(D p) xi - R_D J(p) xi, with J of `motion_of_points` and xi the error. In closed bite, the displacement is zero.
     """
     closed = transform_points(rig.T_rest, rig.landmarks)
     D = T_skull_mandible @ se3_inverse(rig.T_rest)

@@ -34,7 +34,7 @@ _FEWEST_FRAMES = 20
 #: Minimum principal minor of the Jacobian of an invertible gauge; it is 1 for an undistorted gauge.
 SMALLEST_MINOR = 0.25
 _STIFFNESSES = 4.0 ** np.arange(8)
-_WIDER_MM = 3.0  # margin around the captured poses of the box that is checked, equal to the largest margin of a bound
+_WIDER_MM = 3.0  # margin of the checked box around the captured poses, equal to the largest margin of a bound
 _GRID = 33
 
 
@@ -125,7 +125,7 @@ def smallest_minor(gauge: Gauge, box: Array) -> float:
 
 
 def _fit(u: Array, weights: Array, gauge: Gauge, shown: Mask, stiffness: float) -> Gauge:
-    """Alternate between inverting the gauge for d and fitting the gothic arch and the drop to d."""
+    """Alternate between inverting the gauge for d and fitting the gothic arch and the tooth guidance to d."""
     for _ in range(_ROUNDS):
         gauge = _with_arch(gauge, u, weights, shown, stiffness)
         gauge = _with_drop(gauge, u, weights, shown, stiffness)

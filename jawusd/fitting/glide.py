@@ -27,7 +27,7 @@ from jawusd.meshes.contact import Teeth
 
 _STEP_MM = 0.5  # knot spacing [mm]; cusps and fossae are a few times wider
 _BEYOND_MM = 1.5  # distance beyond the captured parameters up to which contact is measured [mm]
-_HIGHEST_MM, _LOWEST_MM = 5.0, -2.5  # range of drops within which contact is searched
+_HIGHEST_MM, _LOWEST_MM = 5.0, -2.5  # range of vertical offsets searched for contact
 _HALVINGS = 4  # number of bisections of the search step, which reduce it to 0.03 mm
 _SMOOTHING = 0.7  # standard deviation of the Gaussian filter, in knots
 _RAISES = 3  # number of iterations that restore the height lost in smoothing
@@ -99,7 +99,7 @@ def _axis(values: Array) -> Array:
 
 
 def _contact_drop(form: AnchoredModel, teeth: Teeth, d2: Array, d3: Array, captured: Array) -> Array:
-    """Return the drop of the incisal point at which the teeth just touch [mm], on a grid (n2, n3)."""
+    """Return how far below closed bite the incisal point is when the teeth just touch [mm], on a grid (n2, n3)."""
     side, front = (x.ravel() for x in np.meshgrid(d2, d3, indexing="ij"))
     wanted = _near(np.stack([side, front], axis=1), captured[:, 1:])
     ahead = front + form.gauge.arch(np.zeros_like(side), side)[0]

@@ -31,17 +31,22 @@ _LEAST_FRAMES, _FRAMES = 60, 300  # minimum number of frames with visible teeth,
 _BLOCKS = 6  # number of contiguous blocks that are held out in turn
 _COMPONENTS, _SMOOTH, _INSIDE = 120, 14, 30  # numbers of components: all, smooth part, familiarity test
 _LEAST_MOVED_MM = 0.5  # minimum standard deviation of each parameter in the training frames; 12 subjects have 1.4 mm
-_START = (2.0, 3.0, 0.3, 0.001)  # initial kernel: length, smooth part, linear part, noise; typical of the result
+_START = (
+    2.0,
+    3.0,
+    0.3,
+    0.001,
+)  # initial kernel (typical of fitted ones): length, smooth part, linear part, noise
 _LOW, _HIGH = np.log([0.2, 0.01, 0.001, 1e-5]), np.log([20.0, 100.0, 100.0, 3.0])
 _STEPS, _MOST_TRIALS = np.log([3.0, 1.7]), 80
 _FALSE_ALARMS = 0.01  # fraction of held-out frames that are flagged as unfamiliar
-_TINY = 1e-9  # minimum limit of the squared distance, needed for faces with a single column
+_TINY = 1e-9  # lower bound of the limit on the squared distance, needed for face data with a single column
 _CHIN_POINTS = 3
-# Maximum error relative to that of each guess; 12 subjects have at most 0.4, faces that belong to other frames at least
-# 1.0.
+# Maximum ratio of the prediction error to that of each baseline. Observed: at most 0.4 for 12 subjects, at least 1.0
+# when face data are paired with the wrong frames.
 _MOST_SHARE = 0.65
-_CLOCK_COMPONENTS = 12  # number of components from which the clock offset of the face is estimated
-_LEAST_EXPLAINED = 0.5  # minimum fraction of the variance of opening and laterotrusion explained by them
+_CLOCK_COMPONENTS = 12  # number of principal components of the face data used to estimate its clock offset
+_LEAST_EXPLAINED = 0.5  # minimum fraction of the variance of opening and laterotrusion that they must explain
 _NAMES = ("opening", "laterotrusion", "protrusion")
 
 
@@ -74,12 +79,12 @@ def fit_skin(
 
     Returns:
         The map. In its meta, "errors_mm" contains the mean held-out errors at the incisal point: that of the map
-        ("skin") and those of simple guesses, "carried" (the last d before a held-out block), "mean" (the mean of all d)
-        and, for points, "chin" (inverse kinematics of three points assumed to be rigid with the bone).
+        ("skin") and those of simple baselines, "carried" (the last d before a held-out block), "mean" (the mean of all
+        d) and, for points, "chin" (inverse kinematics of three points assumed to be rigid with the bone).
 
     Raises:
         ValueError: wrong shapes.
-        FittingError: there are too few frames or too little motion, or the error exceeds 65 % of the error of a guess.
+        FittingError: there are too few frames or too little motion, or the error exceeds 65 % of that of a baseline.
     """
     X, d = np.asarray(X, dtype=np.float64), np.asarray(d, dtype=np.float64)
     points = X.ndim == 3
@@ -118,20 +123,20 @@ def clock_offset(face_s: Array, X: Array, times_s: Array, d: Array) -> float:
     """Return the clock offset [s] between face and jaw data at which the face best explains opening and laterotrusion.
 
     Args:
-        face_s: times of the face [s], shape (F,).
-        X: columns of the face, NaN where hidden, shape (F, K).
-        times_s: times of the jaw [s], shape (N,).
+        face_s: times of the face data [s], shape (F,).
+        X: columns of the face data, NaN where hidden, shape (F, K).
+        times_s: times of the jaw data [s], shape (N,).
         d: jaw parameters [mm], all known, shape (N, 3).
 
     Returns:
-        Offset to be added to the times of the face.
+        Offset to be added to the times of the face data.
 
     Raises:
         FittingError: the takes are too short, or do not match at any offset.
     """
     known = X[np.isfinite(X).all(axis=1)]
     if not len(known):
-        raise FittingError("no frame shows all columns of the face.")
+        raise FittingError("no frame has values in all columns of the face data.")
     known = known[:: max(len(known) // _FRAMES, 1)]
     mean = known.mean(axis=0)
     f = (X - mean) @ np.linalg.svd(known - mean, full_matrices=False)[2][:_CLOCK_COMPONENTS].T
@@ -173,7 +178,8 @@ def _chosen(usable: Mask) -> Indices:
     rows = np.flatnonzero(usable)
     if len(rows) < _LEAST_FRAMES:
         raise FittingError(
-            f"{len(rows)} frames show the teeth and all columns of the face; at least {_LEAST_FRAMES} are needed.",
+            f"{len(rows)} frames show the teeth and have values in all columns of the face data; at least "
+            f"{_LEAST_FRAMES} are needed.",
             hint="Check that both files show the same performance, and that no point is hidden throughout.",
         )
     return rows[np.linspace(0, len(rows) - 1, min(len(rows), _FRAMES)).astype(int)]
@@ -184,12 +190,12 @@ def _check_motion(flat: Array, d: Array, sigma: Array) -> None:
     least = int(np.argmin(moved))
     if moved[least] < _LEAST_MOVED_MM:
         raise FittingError(
-            f"the {_NAMES[least]} varies by {moved[least]:.2f} mm (standard deviation) where the teeth are seen; at "
-            f"least {_LEAST_MOVED_MM:g} mm is needed to learn it.",
+            f"the {_NAMES[least]} varies by {moved[least]:.2f} mm (standard deviation) where the teeth are visible; "
+            f"at least {_LEAST_MOVED_MM:g} mm is needed to learn it.",
             hint="Record opening, both sides and forward movement with parted lips.",
         )
     if not np.ptp(flat, axis=0).any():
-        raise FittingError("no column of the face changes.")
+        raise FittingError("all columns of the face data are constant.")
     if not (sigma > 0).all():
         raise FittingError(f"sigma of d must be positive, found {sigma.min():g} mm.")
 
@@ -200,7 +206,8 @@ def _check_errors(errors: dict[str, float]) -> None:
         if name in errors and errors["skin"] > _MOST_SHARE * errors[name]:
             raise FittingError(
                 f"the jaw learned from the face has an error of {errors['skin']:.2f} mm at the incisal point on "
-                f"held-out frames; {words} has {errors[name]:.2f} mm. At most {_MOST_SHARE:.0%} of that is accepted.",
+                f"held-out frames; the error of {words} is {errors[name]:.2f} mm. At most {_MOST_SHARE:.0%} of that "
+                f"is accepted.",
                 hint="Check that face and jaw show the same performance on one clock, and that the head is stabilised. "
                 "Add points or expressions; if a rigid chin is as good, use inverse kinematics (`rig.ik`).",
             )
@@ -284,7 +291,7 @@ def _head_motions(points: Array, head_error: tuple[float, float], arrays: dict[s
 
 
 def _carried(d: Array, blocks: list[Indices]) -> Array:
-    """Return d of the last frame before each block, shape (M, 3); before the first block, of the frame after it."""
+    """Return d of the last frame before each block, shape (M, 3); for the first block, of the frame after it."""
     held = [d[b[0] - 1] if b[0] else d[b[-1] + 1] for b in blocks]
     return np.concatenate([np.repeat(each[None], len(b), axis=0) for each, b in zip(held, blocks, strict=True)])
 

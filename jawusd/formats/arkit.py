@@ -46,7 +46,8 @@ _FEWEST_REPEATED = 3  # minimum number of distinct time codes from which repetit
 _FEWEST_ROWS, _MOST_ROWS = 0.9, 1.02  # range of the ratio of the median number of rows per second to the requested rate
 _MOST_STEPS_OFF = 2.0  # maximum difference between steps across seconds and within a second [steps]
 # Accepted range of weights, and the weight above which weights are assumed to be percentages. ARKit's weights are 0 to
-# 1; a calibrated neutral face or gains exceed this slightly, percentages and standardised weights by far.
+# 1. Subtracting a neutral face or applying gains can move weights slightly outside this range; percentages and
+# standardised weights lie far outside.
 _LEAST_WEIGHT, _MOST_WEIGHT, _PERCENT = -0.5, 2.0, 10.0
 _MAX_BYTES = 1 << 30
 _MAX_MAPPING_BYTES = 1 << 20

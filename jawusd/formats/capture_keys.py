@@ -331,7 +331,7 @@ def _named(key: int | str, model: type[BaseModel] | None) -> FieldInfo | None:
 
 
 def _owner(key: str, model: type[BaseModel]) -> str:
-    """Return the table that contains a key, as written in the file, "" if there is none."""
+    """Return the name, as written in the file, of the table that contains a key, or "" if there is none."""
     for name, field in model.model_fields.items():
         below, many = table_model(field)
         if below is not None and key in _keys(below):

@@ -82,7 +82,7 @@ def _where(location: Location, data: Mapping[str, object]) -> str:
 
 
 def _problem(value: Path, full: Path, folder: Path, allow_outside: bool) -> tuple[str, str | None] | None:
-    """Return the problem with a path and a hint, or None if there is no problem."""
+    """Return a description of what is wrong with a path, and a hint; None if nothing is wrong."""
     if os.name != "nt" and _DRIVE.match(str(value)):
         return "is a Windows path, which does not exist on this system.", _RELATIVE
     # Links are resolved because a link inside the folder may point outside.

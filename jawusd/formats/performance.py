@@ -56,9 +56,9 @@ class Performance:
         d: jaw parameters [mm], shape (F, 3).
         covariance: covariance of head twist (in head axes about `pivot`; omega [rad], v [mm]) and of d [mm], shape
             (F, 9, 9).
-        rig_covariance: covariance of d that the error of the rig causes [mm^2], shape (F, 3, 3).
-        rig_pose_covariance: covariance of the mandible's pose that the error of the rig causes, twist (omega [rad], v
-            [mm]) in the skull frame, shape (F, 6, 6).
+        rig_covariance: covariance of d due to rig error [mm^2], shape (F, 3, 3).
+        rig_pose_covariance: covariance of the mandible's pose due to rig error, as a twist (omega [rad], v [mm]) in the
+            skull frame, shape (F, 6, 6).
         pivot: reference point of the head twist, upper scan frame [mm], shape (3,).
         state: `SolveState`, shape (F,).
         found: arches whose outlines were used, (upper, lower), shape (F, 2).
@@ -69,7 +69,7 @@ class Performance:
         valid: whether the rig allows the pose (inside the bound or within the tolerance of measured poses), shape (F,).
         verdict: the rig's verdict on each pose as text, length F.
         camera_names: names of the cameras, length C.
-        notes: estimates for the whole take.
+        notes: estimates that apply to the whole take.
     """
 
     frames: NDArray[np.int64]

@@ -1,4 +1,4 @@
-"""Point sets and triangles: matching of a moved copy, welding of coincident points, ray intersection."""
+"""Point sets and triangles: matching to a rigidly moved copy, welding of coincident points, ray intersection."""
 
 from __future__ import annotations
 

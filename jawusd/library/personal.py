@@ -100,7 +100,7 @@ class Expected:
         }
 
     def table(self) -> dict[str, dict[str, float]]:
-        """Return mean, median, p95 and max of the errors by landmark [mm], in the form of a model's error tables."""
+        """Return mean, median, p95 and max of the errors per landmark [mm], in the form of a model's error tables."""
         return {
             name: {
                 "mean": float(column.mean()),
@@ -187,7 +187,7 @@ def _captured_shares(donor: Donor, count: int) -> Array:
 
 
 def _weights(donors: Sequence[Donor], target: Array, bandwidth_mm: float | None) -> Array:
-    """Return the weights (n,) of the donors, which sum to 1; without a bandwidth, only the closest donor counts."""
+    """Return the weights (n,) of the donors, which sum to 1; without a bandwidth, only the closest donor has weight."""
     distance = np.array([landmark_distance_mm(donor.landmarks, target) for donor in donors])
     if bandwidth_mm is None:
         return (np.arange(len(donors)) == distance.argmin()).astype(np.float64)

@@ -24,8 +24,8 @@ _ENDS_S = 4.0  # duration that is decoded at each end of a clip; `sync` reads th
 _PART = 48  # number of images per decoded part
 _SPARSE = 4  # pixel step in both directions when images are compared
 _LISTED = 5
-# Percentile that defines the usual change between images, and number of images before and after an image over which it
-# is computed. Thresholds for repeated images are relative to the usual change. They were chosen with
+# Percentile that defines the usual change between consecutive images, and number of images before and after an image
+# over which it is computed. Thresholds for repeated images are relative to the usual change. They were chosen with
 # `tests/benchmarks/frozen.py` and 150 of its random clips; 10 % of 150 other clips without a fault are reported:
 # noise-free scenes at rest, and scenes whose noise is removed by strong compression.
 _MOST, _AROUND = 75, 48

@@ -29,7 +29,7 @@ _BYTE_BITS = 8
 # 255 levels too dark.
 TO_RGB = Interpolation.BILINEAR | Interpolation.ACCURATE_RND | Interpolation.FULL_CHR_H_INT
 _AROUND_PX = 8  # margin around a converted region, for chroma interpolation
-_STEP_PX = 32  # alignment of the sides of a converted region
+_STEP_PX = 32  # start and end of a converted region are multiples of this
 _ANY_TIME = Fraction(1, 1000)  # time base that FFmpeg's filters need; the value does not matter
 _FULL_RANGE = 2  # FFmpeg's AVCOL_RANGE_JPEG, the full range
 _PLANAR_VIDEO_RANGE = ("yuv420p", "yuv422p", "yuv444p", "nv12", "nv21")

@@ -95,7 +95,7 @@ class CameraWall:
         Args:
             scans: scans to draw.
             fill: opacity of the crowns.
-            partly: called with incomplete images while cameras are decoded, if decoding takes long.
+            partly: callback that receives incomplete images while cameras are decoded, if decoding takes long.
 
         Raises:
             CaptureError: a camera's image cannot be decoded.

@@ -33,9 +33,9 @@ _LOWEST = 0.12
 # the hull.
 _LEAVING, _STRICTER_PER_MM, _STRICTEST_MM = 0.06, 3.0, 0.6
 # Maximum fraction of a component's crown-gum border that has no crease (median over a dental arch) for the components
-# to be treated as crowns with gum. Observed: 0.02 to 0.162 for crowns with a collar of gum (58 scans of synthetic
-# subjects with 5,000 faces and more); 0.8 to 1.0 for synthetic crowns without gum, 0.24 to 0.34 for real ones, and
-# 0.167 in one scan recorded from the root side, whose grooves and necks resemble short creases.
+# to be treated as crowns with gum. Observed: 0.02 to 0.162 for synthetic crowns with a collar of gum (58 scans of 5,000
+# faces or more); 0.8 to 1.0 for synthetic crowns without gum; 0.24 to 0.34 for real crowns without gum; 0.167 for one
+# scan recorded from the root side, on which grooves and necks resemble short creases.
 _MOST_WEAK = 0.165
 # Median edge length above which creases at the gum line are not resolved, so that crowns may include gum.
 _COARSE_MM = 1.2

@@ -21,7 +21,7 @@ from jawusd.pipeline.subject import BONES, Subject, registered_subject
 
 DEFAULT_FPS = 24.0
 _PROXY_FACES = 1500  # number of faces of a proxy mesh, not counting those along borders; see `proxy_of`
-_TEETH_APART_MM = 15.0  # maximum distance between tooth landmarks of model and scans, picked or detected
+_TEETH_APART_MM = 15.0  # maximum distance between the (picked or detected) tooth landmarks of model and scans
 
 
 def check_same_jaw(subject: Subject, model: JawModel) -> None:

@@ -245,7 +245,7 @@ def _write(root: Path, outcomes: Sequence[Outcome]) -> None:
 class _IgnoreInterrupt(WorkerPlugin):
     """Ignore signals that a terminal or service sends to all processes; the parent process handles them.
 
-    If such a signal ended a worker, its replacement would continue the build.
+    Otherwise a worker ended by such a signal would be replaced, and the build would go on.
     """
 
     def setup(self, worker: Worker) -> None:

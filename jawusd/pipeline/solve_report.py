@@ -122,7 +122,7 @@ def _write(
 def _rate(tracks: Tracks) -> float:
     rate = tracks.meta.get("fps")
     if not isinstance(rate, float) or not 0 < rate < math.inf:
-        raise FormatError("does not state its frame rate.", hint="Name the shot with --capture.")
+        raise FormatError("contains no frame rate.", hint="Name its capture file with --capture.")
     return rate
 
 

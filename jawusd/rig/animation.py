@@ -1,8 +1,8 @@
 """Animation layers: samples of d for tools that support the rig, and baked translations and quaternions for others.
 
-All readers interpolate d linearly between samples; the baked ops follow the model along that motion. Interpolated
-matrix samples would shear, and a product of one transform per parameter would be wrong by millimetres if several
-parameters are not 0.
+All readers interpolate d linearly between samples; the baked ops follow the model along that motion. Matrix ops are not
+used, because they shear when interpolated; nor is a product of one transform per parameter, which would be wrong by
+millimetres if several parameters are not 0.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ def write_animation(
     """
     out, actor = Path(out), Path(actor)
     if not actor.is_file():
-        raise RigError("there is no such file; the layer needs it as its sublayer.", path=actor)
+        raise RigError("there is no such file; the animation layer refers to the rig as a sublayer.", path=actor)
     rig = load_rig(actor) if rig is None else rig
     frames, d = np.asarray(frames, dtype=np.float64), np.asarray(d, dtype=np.float64)
     if frames.ndim != 1 or d.shape != (len(frames), 3):
@@ -91,7 +91,7 @@ def write_animation(
         raise RigError(f"the frame rate is {fps}; it must be greater than 0.", path=out)
     if frames[-1] - frames[0] > _MAX_FRAMES or np.abs(frames).max() > _FARTHEST_FRAME:
         raise RigError(
-            f"has frames {frames[0]:g} to {frames[-1]:g}; an animation has at most {_MAX_FRAMES} frames within "
+            f"has frames {frames[0]:g} to {frames[-1]:g}; an animation may have at most {_MAX_FRAMES} frames within "
             f"+-{_FARTHEST_FRAME:g}.",
             path=out,
         )
@@ -125,7 +125,7 @@ def root_prim_of(actor: Path) -> str:
     names = [prim.GetName() for prim in rig_prims(stage) if prim.GetPath().IsRootPrimPath()]
     if len(names) != 1:
         raise RigError(
-            "must have exactly one rig as a root prim; the layer needs it as its sublayer.",
+            "must have exactly one rig as a root prim; the animation layer refers to it as a sublayer.",
             path=actor,
             hint="Choose the rig of a shot with --prim.",
         )
@@ -135,8 +135,8 @@ def root_prim_of(actor: Path) -> str:
 def bake_times(rig: JawRig, frames: Array, d: Array, span: Array) -> tuple[Array, Array]:
     """Return the times (n,) of the baked samples and the poses T_skull_mandible (n, 4, 4) at these times.
 
-    The times are every whole frame of the span, every sample of d, and as many times in between as keep all landmarks
-    within 0.02 mm of the model.
+    The times are every whole frame of the span, every sample of d, and as many times in between as are needed to keep
+    all landmarks within 0.02 mm of the model.
 
     Args:
         frames: Times of the samples of d, increasing, shape (F,).
@@ -230,7 +230,7 @@ def write_splines(
     slopes: ArrayLike | None = None,
     curved: ArrayLike | None = None,
 ) -> Path:
-    """Write a layer over an animation layer that contains the keys of the animation as splines.
+    """Write a layer that sublayers an animation layer and contains the keys of the animation as splines.
 
     The splines interpolate the animation's samples. Other layers of a rig contain no splines, because OpenUSD before
     25.05 ignores them or cannot parse them, and other readers reject the whole file.

@@ -56,7 +56,7 @@ def _muted(actor: Usd.Prim) -> Iterator[Fault]:
 
 
 def _units(actor: Usd.Prim) -> Iterator[Fault]:
-    """Find units and axes of the stage that differ from those of the rig's layer without a correcting transform."""
+    """Find units and axes of the stage that differ from those of the rig's layer and that no transform corrects."""
     stage, root = actor.GetStage(), actor.GetStage().GetRootLayer()
     stack = actor.GetAttribute("jaw:formatVersion").GetPropertyStack()
     own = stack[-1].layer if stack else root

@@ -1,6 +1,6 @@
 """Files that a layer refers to, and the checksums that `actor.usda` records for the binary layers of a rig.
 
-Only the file of an asset path counts: format arguments and paths inside packages are dropped. Checksums are compared
+Only the file of an asset path counts: format arguments and paths inside packages are removed. Checksums are compared
 before OpenUSD parses a file, which may crash on a damaged one.
 """
 
@@ -50,7 +50,7 @@ def target_of(layer: Sdf.Layer, asset: str) -> str | None:
 
 
 def with_variables(layer: Sdf.Layer, variables: Mapping[str, object]) -> Sdf.Layer:
-    """Return a copy of a layer with the given variables, with which `asset_paths` evaluates expressions.
+    """Return a copy of a layer with the given expression variables, which `asset_paths` uses.
 
     The variables of referring layers are stronger than the layer's own. Without variables, return the layer itself.
     """

@@ -132,7 +132,7 @@ def key_times(attribute: Usd.Attribute) -> list[float]:
 
 
 def values_at(attribute: Usd.Attribute, times: Iterable[float]) -> list[float | None]:
-    """Return the values of an attribute at times, evaluating splines here, because OpenUSD 25.02 only reads them."""
+    """Return the values of an attribute at times; splines are evaluated here, because OpenUSD 25.02 only reads them."""
     spline = _spline_of(attribute)
     return [attribute.Get(time) if spline is None else spline.Eval(time) for time in times]
 

@@ -217,14 +217,14 @@ def _read_camera(name: str, prim: Usd.Prim, size: tuple[int, int], mm: float) ->
     cy = size[1] * (0.5 + optics.verticalApertureOffset / high) - 0.5
     K = np.array([[focal / wide * size[0], 0.0, cx], [0.0, focal / high * size[1], cy], [0.0, 0.0, 1.0]])
     placed = np.array(UsdGeom.Xformable(prim).ComputeLocalToWorldTransform(time), np.float64).T
-    u, _, vt = np.linalg.svd(placed[:3, :3])  # drop the parents' scales: they move a camera but do not change its image
+    u, _, vt = np.linalg.svd(placed[:3, :3])  # ignore parents' scales: they move a camera but do not change its image
     T_world_cam = make_transform(u @ vt @ _FLIP[:3, :3], mm * placed[:3, 3])
     lens = prim.GetAttribute("jaw:distortion").Get() if prim.HasAttribute("jaw:distortion") else None
     return Camera(name, size, K, np.zeros(0) if lens is None else np.array(lens), se3_inverse(T_world_cam))
 
 
 def _define_camera(stage: Usd.Stage, path: Sdf.Path, camera: Camera, plate: str) -> None:
-    """Define a camera. The image spans pixel edges, half a pixel beyond the first and last pixel centres."""
+    """Define a camera whose aperture spans the image to its edges, half a pixel beyond the outer pixel centres."""
     (fx, skew, cx), (_, fy, cy) = camera.K[:2]
     width, height = camera.size_px
     if abs(skew) > _LARGEST_SKEW * fx:

@@ -87,7 +87,7 @@ def rename_actor(layer: Sdf.Layer, name: str, before: str = Sdf.Path(ACTOR).name
 
 
 def _replace(items: object, change: Callable[[T], T]) -> None:
-    """Replace each item of an OpenUSD list op by its result under a function, in place."""
+    """Apply a function to each item of an OpenUSD list op, in place."""
     for group in ("explicitItems", "prependedItems", "appendedItems", "addedItems", "deletedItems"):
         old = list(getattr(items, group))
         new = [change(item) for item in old]

@@ -72,7 +72,7 @@ def poses_at(mandible: Usd.Prim, actor: Usd.Prim, times: ArrayLike, path: object
         worst = int(np.argmax(np.where(np.isfinite(defect), defect, np.inf)))
         raise FormatError(
             f"the mandible is not rigid at frame {codes[worst]}: "
-            f"its defect is {defect[worst]:.2g}; the maximum is {_RIGID:g}.",
+            f"its deviation from a rigid transform is {defect[worst]:.2g}; the maximum is {_RIGID:g}.",
             path=str(path),
             hint="Matrix samples shear when interpolated: key translate and orient instead.",
         )
@@ -232,8 +232,8 @@ def frames_of_stage(stage: Usd.Stage, path: object) -> NDArray[np.int64]:
     first, last = int(np.ceil(stage.GetStartTimeCode())), int(np.floor(stage.GetEndTimeCode()))
     if not 0 < last - first + 1 <= MAX_FRAMES:
         raise FormatError(
-            f"its time codes run from {stage.GetStartTimeCode():g} to {stage.GetEndTimeCode():g}: this contains no "
-            f"whole frame, or more than {MAX_FRAMES}.",
+            f"its time codes run from {stage.GetStartTimeCode():g} to {stage.GetEndTimeCode():g}: this range contains "
+            f"no whole frame, or more than {MAX_FRAMES}.",
             path=str(path),
         )
     return np.arange(first, last + 1)
@@ -242,9 +242,9 @@ def frames_of_stage(stage: Usd.Stage, path: object) -> NDArray[np.int64]:
 def comparison_times(actor: Usd.Prim, moving: list[Usd.Attribute], by_bones: bool) -> tuple[Array, Array]:
     """Return the times at which a mandible is compared with d, and the allowed distances.
 
-    The times are the keys of d and of the mandible, because a jaw does not move if only its d is keyed, and the whole
-    frames between these keys, because d and the mandible are interpolated differently. For bones the keys suffice:
-    bones have a key at every key of d.
+    The times are the keys of d and of the mandible (if only d is keyed, the jaw does not move), and the whole frames
+    between these keys (d and the mandible are interpolated differently). For bones the keys suffice: bones have a key
+    at every key of d.
 
     Args:
         moving: The attributes that move the mandible.

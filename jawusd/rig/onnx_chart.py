@@ -1,7 +1,7 @@
 """The charts of the kinds of models as ONNX operators: motions with derivatives, as in `jawusd.evaluator.models`.
 
-For single poses, the running time depends on the number of operators. Vectors and matrices of a row are therefore kept
-together in one value, except in the scalar formulas of the gauge.
+For single poses, the running time depends on the number of operators. The vectors and matrices of a pose are therefore
+packed into one value, except in the scalar formulas of the gauge.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ from jawusd.geometry.rodrigues import Triple
 from jawusd.geometry.so3 import hat
 from jawusd.rig.onnx_graph import Graph, Value
 
-_OPENING_TOLERANCE = 1e-10  # step of the opening, relative to 1 mm plus the opening, below which it has converged
-#: Step of finite differences, and displacements of a point for central differences: none, ahead, behind [mm].
+_OPENING_TOLERANCE = 1e-10  # step of the opening below which it has converged, relative to 1 mm plus the opening
+#: Step of finite differences, and displacements of a point for central differences: none, forward, backward [mm].
 STEP_MM = 1e-3
 SHIFTS_MM = STEP_MM * np.array([np.zeros(3), *np.eye(3), *-np.eye(3)])
 # Maps 1, s, s^2, s^3 to themselves and their derivatives with respect to s.
@@ -81,7 +81,7 @@ class Chart(Protocol):
 
 
 class AnchoredChart:
-    """The displacement u of the lower incisal point, from which the spline gives the rotation."""
+    """Chart whose coordinates are the displacement u of the lower incisal point; the spline maps u to the rotation."""
 
     def __init__(self, rig: JawRig) -> None:
         self._model = AnchoredModel.from_arrays(rig.arrays)
@@ -118,7 +118,7 @@ class AnchoredChart:
         return Value(g, outputs[-1])
 
     def _opening_step(self, u: Triple[Value]) -> onnx.GraphProto:
-        """Return the loop body: a Newton step, or the middle of the bracket if the step leaves it or has stalled."""
+        """Return the loop body: a Newton step, or bisection if the step leaves the bracket or has stalled."""
         o = Graph(np.float64, "o_")
         x, low, high = (Value(o, f"o_{name}") for name in ("opening", "low", "high"))
         outer = triple([Value(o, value.name) for value in u])
@@ -169,7 +169,7 @@ class AnchoredChart:
         return Elementary(g.sqrt, g.exp, g.clip, lambda _, d2, d3: self._glide(g, d2, d3))
 
     def _glide(self, g: Graph, d2: Value, d3: Value) -> Triple[Value]:
-        """Return the drop of the glide table [mm] and its derivatives with respect to d2 and d3, each (n, 1)."""
+        """Return the downward offset of the glide surface [mm] and its derivatives (d2 and d3), each (n, 1)."""
         table = self._model.gauge.glide
         if table is None:
             nothing = g.constant([[0.0]])
@@ -199,14 +199,14 @@ class AnchoredChart:
 
 
 class ParameterChart:
-    """The jaw parameters d of any kind of model; the derivatives are central differences."""
+    """Chart of the jaw parameters d of any kind of model, with derivatives by central differences."""
 
     def __init__(self, rig: JawRig) -> None:
         self._formula = MODELS[rig.kind](flat_arrays(rig.arrays))
         self._starts, self.point = rig.model.starts, np.zeros(3)
 
     def start(self, g: Graph, u: Value) -> Value:
-        """Return the grid points whose incisal displacement is nearest."""
+        """Return the grid points whose incisal displacement is nearest to u."""
         starts = self._starts
         # |a - b|^2 without |b|^2, which is the same for all grid points
         squares = (starts.displacements**2).sum(axis=1)
@@ -233,7 +233,7 @@ class ParameterChart:
 
 
 class AdditiveChart(ParameterChart):
-    """The jaw parameters d, which the curves map to twists."""
+    """Chart of the jaw parameters d, which the curves map to twists."""
 
     def motion(self, g: Graph, x: Value) -> ChartMotion:
         """Return the motions at d = x (n, 3) [mm], with exact derivatives."""
@@ -274,7 +274,7 @@ class _Turning:
 
     @classmethod
     def of(cls, g: Graph, omega: Value) -> _Turning:
-        """Compute them for rotation vectors (n, 3) [rad]."""
+        """Compute the powers and coefficients for rotation vectors (n, 3) [rad]."""
         W, squared = omega @ _HAT, g.sum_columns(omega * omega)
         matrix = g.reshape(W, [-1, 3, 3])
         WW = g.reshape(g.op("MatMul", matrix, matrix), [-1, 9])
@@ -320,7 +320,7 @@ def moved_vectors(g: Graph, w: Value, vectors: Value) -> Value:
 
 
 def loop_body(g: Graph, name: str, state: dict[str, int]) -> onnx.GraphProto:
-    """Return a graph as the body of a loop over columns: the values NAME become NAME_out, with the prefix of the graph.
+    """Return a graph as a loop body: an iteration reads the values NAME and writes NAME_out, with the graph's prefix.
 
     Args:
         state: number of columns of each value that an iteration passes to the next one.
@@ -343,5 +343,5 @@ def zero_column(g: Graph, rows: Value) -> Value:
 
 
 def stored(tables: dict[str, Rows]) -> dict[str, Array]:
-    """Return tables in the form in which graphs store them."""
+    """Return tables as arrays, which graphs store as constants."""
     return {name: np.array(table) for name, table in tables.items()}

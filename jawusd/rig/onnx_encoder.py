@@ -1,8 +1,9 @@
 """The search for the nearest pose of the exact jaw model as ONNX operators.
 
-As in `jawusd.evaluator.encoding`, the distance of two poses is that of four homogeneous vectors, and damped
-Gauss-Newton with analytic derivatives minimises it in the chart of the model, in an ONNX loop. It converges slowly for
-poses far from those of the model. If any row has not converged, a second loop continues with Newton's method.
+As in `jawusd.evaluator.encoding`, the distance between two poses is that between four homogeneous vectors moved by
+each. Damped Gauss-Newton with analytic derivatives, an ONNX loop, minimises it in the chart of the model. It converges
+slowly for poses far from those of the model. If any row has not converged, a second loop continues with Newton's
+method.
 """
 
 from __future__ import annotations
@@ -78,7 +79,7 @@ def add_encoder(g: Graph, rig: JawRig, pose: Value, d: str, residual: str) -> No
 
 
 def _images_of_pose(rig: JawRig, vectors: Array, at_rest: Array) -> Array:
-    """Return the matrix (16, 3 k) from flat poses to the images of vectors (4, k), anatomical frame."""
+    """Return the matrix (16, 3 k) that maps flattened poses to moved vectors (4, k), anatomical frame."""
     in_mandible = se3_inverse(at_rest) @ vectors
     # entry (i, j) of the pose moves vector k by T_anatomical_skull[:, i] in_mandible[j, k]
     matrix = np.einsum("ai,jk->ijak", rig.T_anatomical_skull[:3], in_mandible)
@@ -116,7 +117,7 @@ def _body(prefix: str, chart: Chart, vectors: Array, newton: bool) -> onnx.Graph
 
 
 def _moving(g: Graph, step: Value, name: str | None = None) -> Value:
-    """Return whether any row has a long step (n, 3) [mm]; comparisons with NaN are false."""
+    """Return whether any of the steps (n, 3) [mm] is too long for convergence; comparisons with NaN are false."""
     long = g.op("Cast", g.op("Greater", g.op("Abs", step), _CONVERGED_MM), to=TensorProto.INT64)
     return g.op("Greater", g.op("ReduceSum", long, keepdims=0), g.constant(0, np.int64), name=name)
 
@@ -145,7 +146,7 @@ def _determinant(matrix: Value, cofactors: Value) -> Value:
 
 
 def _measured(g: Graph, chart: Chart, vectors: Array, x: Value, target: Value) -> Value:
-    """Return the products (n, 16) of the derivatives and the residual of the images at x (n, 3)."""
+    """Return the products (n, 16) of the derivatives and the residual of the moved vectors at x (n, 3)."""
     motion = chart.motion(g, x)
     weight = vectors[3]
     # vectors relative to the reference point, which is displaced by `shift`
@@ -160,7 +161,7 @@ def _measured(g: Graph, chart: Chart, vectors: Array, x: Value, target: Value) -
 
 
 def _curved(g: Graph, chart: Chart, vectors: Array, x: Value, target: Value) -> Value:
-    """Return `_measured` with half the Hessian of the cost, where it is positive definite, in place of Gauss-Newton's.
+    """Return `_measured` with half the Hessian of the cost in place of the Gauss-Newton matrix where it is definite.
 
     The Hessian is the central difference of the gradient.
     """

@@ -96,13 +96,13 @@ class Graph:
         return self.op("Concat", *parts, axis=axis, name=name)
 
     def parts(self, a: Value, count: int, *, axis: int = 1) -> list[Value]:
-        """Return equal parts of a value along an axis."""
+        """Split a value into equal parts along an axis."""
         names = [f"{self.prefix}part{len(self.nodes)}_{i}" for i in range(count)]
         self.nodes.append(helper.make_node("Split", [a.name], names, axis=axis))
         return [Value(self, name) for name in names]
 
     def groups(self, a: Value, widths: Sequence[int]) -> list[Value]:
-        """Return groups of a value along axis 1, of given widths."""
+        """Split a value along axis 1 into parts of given widths."""
         names = [f"{self.prefix}group{len(self.nodes)}_{i}" for i in range(len(widths))]
         sizes = self.constant(widths, np.int64)
         self.nodes.append(helper.make_node("Split", [a.name, sizes.name], names, axis=1))
@@ -141,7 +141,7 @@ class Graph:
         return self.op("Where", small, series[3], (1.0 - a / (2.0 * b)) / far)
 
     def angle_slopes(self, squared: Value, coefficients: Triple[Value]) -> tuple[Value, Value]:
-        """Return the derivatives of b and c by the squared angle x: ``(a - 2 b) / 2x`` and ``(b - 3 c) / 2x``."""
+        """Return db/dx = ``(a - 2 b) / 2x`` and dc/dx = ``(b - 3 c) / 2x``, where x is the squared angle."""
         small, far, _ = self._near_and_far(squared)
         a, b, c = coefficients
         near = self.op("Min", squared, _SERIES_BELOW_RAD2)

@@ -1,4 +1,4 @@
-"""The ONNX sidecars of a rig: graphs that map d to pose, twist and margin, and a pose to d and residual, exactly.
+"""The ONNX sidecars of a rig: exact graphs from d to pose, twist and margin, and from a pose to d and residual.
 
 Decoder and encoder are separate files: the decoder needs only arithmetic, which every runtime supports, but the encoder
 needs a loop. The batch size is dynamic. Graphs are run by onnxruntime if it is installed, otherwise by the reference

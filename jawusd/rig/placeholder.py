@@ -38,8 +38,8 @@ _FROM_MOTION, _FROM_MEANS = "estimated from the motion", "mean adult positions"
 #: Mean error of a condyle centre [mm] by source, on 50 synthetic subjects; `tests/benchmarks/head.py` measures it.
 CONDYLE_ERROR_MM = {_FROM_MOTION: 2.3, _FROM_MEANS: 8.6}
 
-# Width between the first molars and length of the mean lower arch [mm], which the parametric bones fit, and the limits
-# of the scale, within which almost all adults are; scans of a few teeth would exceed them.
+# Width between the first molars and length of the mean lower arch [mm], for which the parametric bones are sized, and
+# the limits of their scale, which include almost all adults; scans of a few teeth would exceed them.
 _MEAN_ARCH_MM = np.array([44.5, 46.0])
 _ARCH_SCALE = (0.8, 1.25)
 # Mean adult eminence: height, half width and start [mm], which give an inclination of 41 degrees (Cadiax studies).
@@ -107,7 +107,7 @@ def find_condyles(rig: JawRig) -> tuple[Array, str]:
 
 
 def condyles_from_motion(poses: Array, mean: Array) -> Array | None:
-    """Return the condyle centres near mean positions whose trajectories form the thinnest band; None without them.
+    """Return the condyle centres near mean positions whose trajectories form the thinnest band; None if unclear.
 
     Args:
         poses: Motion in the anatomical frame, the identity with the teeth closed, shape (N, 4, 4).
@@ -121,7 +121,7 @@ def condyles_from_motion(poses: Array, mean: Array) -> Array | None:
 
 
 def _thinnest(poses: Array, mean: Array) -> Array | None:
-    """Return the point near a mean position whose sagittal trajectories form the thinnest band; None without one."""
+    """Return the point near a mean position whose sagittal trajectories form the thinnest band; None if unclear."""
     offsets = np.arange(-_REACH_MM, _REACH_MM + 0.5 * _STEP_MM, _STEP_MM)
     grid = np.stack(np.meshgrid([0.0], offsets, offsets, indexing="ij"), axis=-1)[0] + mean
     thickness = _thickness(poses, grid.reshape(-1, 3)).reshape(grid.shape[:2])

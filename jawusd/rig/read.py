@@ -109,7 +109,7 @@ def rig_of(prim: Usd.Prim, where: object) -> JawRig:
     packed = prim.GetStage().GetRootLayer().identifier.endswith(".usdz")
     if packed and not set(recorded_hashes(prim)) <= {None, rig.model_hash}:
         raise FormatError(
-            f"{prim.GetPath()} does not match its model (jaw:modelHash): packing mixed files of several actors.",
+            f"{prim.GetPath()} does not match its model (jaw:modelHash): packing mixed up files of several actors.",
             path=str(where),
             hint="Pack shots with `jawusd publish SHOT -o shot.usdz`, or publish the actors under other names first.",
         )

@@ -137,7 +137,7 @@ def check_bounds(prim: Usd.Prim) -> Iterator[Finding]:
 
 
 def check_mandible(prim: Usd.Prim) -> Iterator[Finding]:
-    """Check that the mandible moves like the model: by translate (double3) and orient (quatd) only, or by bones."""
+    """Check that the mandible moves like the model, and only by translate (double3) and orient (quatd) or by bones."""
     if not prim.IsLoaded():
         yield _finding("error", "Mandible", prim, "the geometry (payload) is not loaded and cannot be checked.")
         return

@@ -122,7 +122,7 @@ def joint_poses(rig: JawRig, d: Array) -> Array:
 
 
 def _hinge(rig: JawRig) -> Array:
-    """Return the joint with closed teeth, shape (4, 4) [mm]: midway between the condyles, with the skull's axes."""
+    """Return the joint's rest transform (4, 4) [mm]: midway between the condyles, with the skull's axes."""
     condyles = [LANDMARKS.index(name) for name in ("condyle_left", "condyle_right")]
     return make_transform(np.eye(3), transform_points(rig.T_rest, rig.landmarks[condyles]).mean(axis=0))
 
@@ -158,7 +158,7 @@ def _define_motion(stage: Usd.Stage, rig: JawRig, frames: ArrayLike | None, d: A
 
 def _bind(layer: Sdf.Layer, rig: JawRig, meshes: Iterable[Sdf.Path], skeleton: Sdf.Path, mandible: Sdf.Path) -> None:
     """Bind the payload's meshes rigidly to the joints, those of the mandible to the jaw; the payload is not loaded."""
-    # The bind transforms place the meshes. Without this order, Blender would apply the payload's ops as well.
+    # The bind transforms place the meshes. The empty op order keeps Blender from applying the payload's ops as well.
     order = Sdf.AttributeSpec(
         Sdf.CreatePrimInLayer(layer, mandible), "xformOpOrder", _TYPES.TokenArray, Sdf.VariabilityUniform
     )

@@ -99,7 +99,7 @@ def fit_poses_of_stage(
     fitted, misfit_mm = np.empty((2, len(frames), 4, 4)), 0.0
     for k, frame in enumerate(frames.tolist()):
         seen = [place.points(Usd.TimeCode(frame)) for place in places]
-        # one scale for skull and mandible: the stage may be in cm, or the actor scaled
+        # one scale for skull and mandible: the stage may be in cm, or the actor may be scaled
         scale = _spread(seen[0]) / _spread(places[0].source)
         for i, (place, points) in enumerate(zip(places, seen, strict=True)):
             fitted[i, k] = rigid_fit(place.source, points / scale)
@@ -202,7 +202,7 @@ def _distinct(mesh: Mesh) -> int:
 
 
 def _correspondence(mesh: Mesh, found: _Points) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return indices of corresponding vertices in a rig's mesh and in the stage: by shape, otherwise by order."""
+    """Return indices of corresponding vertices in a rig's mesh and in the stage, matched by shape or else by order."""
     used = np.unique(mesh.faces).astype(np.int64)
     spread = np.unique(np.linspace(0, len(used) - 1, _POINTS).astype(int))
     same = len(mesh.vertices) == len(found.all)

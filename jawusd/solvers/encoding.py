@@ -36,7 +36,7 @@ def encoded(chart: Chart, vectors: Tensor, target: Tensor, u: Tensor) -> tuple[T
         u: Displacements (n, 3) [mm] of the incisal point, where the search starts.
 
     Returns:
-        d (n, 3) [mm], and the residuals (n, 3 m) [mm]: images of the vectors minus targets. Second derivatives of their
+        d (n, 3) [mm], and the residuals (n, 3 m) [mm]: moved vectors minus targets. Second derivatives of their
         sum of squares are exact; those of single residuals are not.
     """
     residual = _residual_of(chart, vectors)

@@ -251,7 +251,7 @@ class JawLayer(nn.Module):
         """Return the nearest d [mm], shape (..., 3), and the residuals (..., 12) [mm]."""
         T = self._rows(T_skull_mandible, (4, 4), "T_skull_mandible")
         moved = (self.to_anatomical @ T @ self.incisor)[:, :3] - (self.closed @ self.incisor)[:3]
-        # images of the four vectors that represent the landmarks; see `evaluator.encoding`
+        # the four vectors that represent the landmarks, after the motion; see `evaluator.encoding`
         target = (self.to_anatomical @ T @ self.vectors)[:, :3]
         d, residuals = encoded(self.motion, self.vectors_at_rest, target, moved)
         batch = T_skull_mandible.shape[:-2]

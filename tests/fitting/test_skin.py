@@ -96,7 +96,7 @@ def test_one_column_and_those_of_a_mesh_are_learned(take):
         (lambda X, d, seen: (X, d, seen & (np.arange(len(d)) < 70)), "at least 60 are needed"),
         (lambda X, d, seen: (np.where(np.arange(40)[:, None] == 7, np.nan, X), d, seen), "0 frames show the teeth"),
         (lambda X, d, seen: (X, d * [1, 0.01, 1], seen), "the laterotrusion varies by"),
-        (lambda X, d, seen: (0 * X + 3, d, seen), "no column of the face changes"),
+        (lambda X, d, seen: (0 * X + 3, d, seen), "all columns of the face data are constant"),
         (lambda X, d, seen: (np.roll(X, 480, axis=0).reshape(len(X), -1), d, seen), "At most 65%"),
     ],
 )

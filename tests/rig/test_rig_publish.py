@@ -103,7 +103,7 @@ def test_actors_mixed_up_by_a_packager_are_refused(tmp_path, file):
         try:
             assert load_rig(package, f"/Shot/{name}").kind == kind
         except FormatError as error:
-            refused += "packing mixed files" in str(error)
+            refused += "packing mixed up files" in str(error)
     assert refused == 1
     found = [finding.message for finding in validate_stage(package) if finding.rule == "Model"]
     assert any("mixed" in message for message in found)

@@ -17,7 +17,7 @@ from jawusd.media.masks import open_masks
 from jawusd.media.working_view import WorkingView
 from jawusd.tracking.contour.views import FEWEST_CAMERAS, MaskViews
 
-_BESIDE = 2  # number of surveyed frames, on either side of a chosen one, that are redundant
+_BESIDE = 2  # number of surveyed frames on either side of a chosen frame to skip as redundant
 _WIDTH_PX = 320  # width of the surveyed mask images [px]: enough for mask centres accurate to 0.1 mm
 
 

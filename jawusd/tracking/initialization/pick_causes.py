@@ -1,6 +1,6 @@
 """Mistakes in scans, calibration, masks or picks that can make picks and masks contradict one another.
 
-Each mistake is yielded with the corrected inputs, so that `pick_checks` can test whether they agree.
+Each candidate mistake is yielded with corrected inputs; `pick_checks` tests whether picks and masks then agree.
 """
 
 from __future__ import annotations

@@ -32,7 +32,8 @@ _TRIAL_GATES_PX = (8.0, 6.0)  # residual gates of the short trial alignments of 
 # Longest intervals between steps [frames] that count as no dropped frame, and as one dropped frame.
 _NEXT_FRAMES, _STEADY_FRAMES = 1.5, 2.5
 _FIRST_ROUNDS = 3  # number of refinements of the start, whose error may be a few tenths of a millimetre
-# Fractions of the usual matched contour below which an arch is lost, and below which a lost arch stays lost.
+# Fractions of the usual matched contour length below which an arch becomes lost, and below which a lost arch stays
+# lost.
 _LOST, _AGAIN = 0.33, 0.5
 # number of frames since the last step above which an arch must fit as well as a recovered one
 _UNSURE_FRAMES = 3.0

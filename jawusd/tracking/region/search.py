@@ -192,7 +192,7 @@ class PoseSearch:
         return solution
 
     def with_head_alone(self, solution: Solution, start: Array, look: InstantViews) -> Solution:
-        """Align the head alone if that improves its fit: through the condylar prior, a wrong jaw pose biases it."""
+        """Align the head alone if that improves its fit; a wrong jaw pose biases the head in a joint fit."""
         alone = self._align(start, look, _FAR_GATES_PX, use=_upper_alone(look.views))
         return max((solution, alone), key=lambda trial: float(fitting_share(trial)[0]))
 

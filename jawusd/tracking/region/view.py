@@ -106,14 +106,14 @@ class RegionView:
 
     rgb: NDArray[np.uint8]  # 8-bit pixels, shape (h, w, 3)
     bins: NDArray[np.uint16]  # colour bins, shape (h, w)
-    ratio: NDArray[np.float32]  # log ratios of tooth to background, shape (2, TABLES, BINS)
+    ratio: NDArray[np.float32]  # log-likelihood ratios of tooth to background, shape (2, TABLES, BINS)
     patches: Array  # centres of the patches of both arches, left and front [mm], shape (2, PATCHES, 2)
     axes: Array  # rotation from scan to anatomical axes, shape (3, 3)
     before: Array  # projections of both arches into this camera's image in the previous frame, shape (2, 3, 4)
     counts: Counts | None = None  # statistics to collect in the final alignment of a frame
 
     def likeness(self, arch: int) -> NDArray[np.float32]:
-        """Return the mean log ratio of tooth to background of every pixel for an arch, shape (h, w)."""
+        """Return each pixel's log-likelihood ratio of tooth to background, mean of an arch's tables, shape (h, w)."""
         return np.asarray(self.ratio[arch].mean(0)[self.bins], np.float32)
 
     def search(

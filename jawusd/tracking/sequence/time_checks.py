@@ -125,8 +125,8 @@ def _agree(leads: Array, above: Array | None = None) -> bool:
 def frame_shifts(records: Mapping[int, FrameRecord], masks: MaskViews, solver: ContourSolver) -> FrameShifts:
     """Compare the masks of frames with fast jaw motion with the masks of neighbouring frames.
 
-    If all masks are synchronous at both ends of the take, the frames between are skipped: a step in the delay there
-    would have to be followed by the opposite step.
+    If all masks are in sync at both ends of the take, the frames between are skipped: a delay there would have to
+    appear and vanish again, which is unlikely.
 
     Args:
         records: records of all frames of the take.
@@ -175,7 +175,7 @@ def _judged(poses: Array, view: View, masks: Sequence[NDArray[np.uint8]], shown:
 
 def _in_window(view: View, other: View) -> NDArray[np.uint8]:
     """Return the masks of another frame of the same camera, cropped to the window of a view, shape (2, h, w)."""
-    # Windows differ by whole pixels: cropping x columns subtracts x times row 2 of the matrix from row 0.
+    # The windows are offset by whole pixels: cropping x columns subtracts x times row 2 of the matrix from row 0.
     axis = view.matrix[2]
     moved = np.rint((other.matrix[:2] - view.matrix[:2]) @ axis / (axis @ axis)).astype(int)
     out = np.zeros_like(view.masks)
