@@ -101,12 +101,12 @@ def write_build_report(
     # Decoding, drawing and measuring images releases the GIL.
     with ThreadPoolExecutor(1) as pool:
         drawn = pool.submit(attempt, "images of the footage", unseen, lambda: _overlays(facts, tracks))
-        met = pool.submit(attempt, "contacts of the teeth", unmet, lambda: contact_pictures(model, subject))
+        contacts = attempt("contacts of the teeth", unmet, lambda: contact_pictures(model, subject)) or ()
         data = _without_pictures(folder, facts, tracks, model, subject, experiments)
         progress("report", 1, 4)
         figures = draw_figures(data) | (inline_figures(data.experiments) if data.experiments else {})
         progress("report", 2, 4)
-        overlays, contacts = drawn.result() or (), met.result() or ()
+        overlays = drawn.result() or ()
     left_out = tuple(dict.fromkeys((*data.left_out, *unmet, *unseen)))
     progress("report", 3, 4)
     data = replace(data, overlays=overlays, contacts=contacts, left_out=left_out)
