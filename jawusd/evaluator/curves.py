@@ -125,7 +125,7 @@ class GlideTable:
         return {"glide_d2": k2, "glide_d2_factors": f2, "glide_d3": k3, "glide_d3_factors": f3}
 
     def at_floats(self, d2: float, d3: float) -> tuple[float, float, float]:
-        """Return the drop of the jaw [mm] at d2, d3 [mm], and its derivatives with respect to both."""
+        """Return how far the jaw must open [mm] at d2, d3 [mm], and its derivatives with respect to both."""
         i, j = bisect_right(self._rising[0], d2), bisect_right(self._rising[1], d3)
         s, t = d2 - self._first[0][i], d3 - self._first[1][j]
         powers = np.array(((1.0, s, s * s, s * s * s), (0.0, 1.0, 2.0 * s, 3.0 * s * s)))
@@ -134,7 +134,7 @@ class GlideTable:
         return down, ((b[3] * t + b[2]) * t + b[1]) * t + b[0], (3.0 * a[3] * t + 2.0 * a[2]) * t + a[1]
 
     def at_arrays(self, d2: Array, d3: Array) -> tuple[Array, Array, Array]:
-        """Return the drop of the jaw [mm] at d2, d3 [mm], any shape, and its derivatives with respect to both."""
+        """Return how far the jaw must open [mm] at d2, d3 [mm], any shape, and its derivatives with respect to both."""
         i, j = self.knots[0].searchsorted(d2, side="right"), self.knots[1].searchsorted(d3, side="right")
         s, t = d2 - self.starts[0][i], d3 - self.starts[1][j]
         c = self.coefficients[i, j]

@@ -106,12 +106,12 @@ class Handles(NamedTuple):
 
 
 def vector_images(R: Array, t: Array, vectors: Array) -> Array:
-    """Return the images (n, 3, m) of homogeneous vectors (4, m) under motions R (n, 3, 3), t (n, 3) [mm]."""
+    """Apply motions R (n, 3, 3), t (n, 3) [mm] to homogeneous vectors (4, m); return shape (n, 3, m)."""
     return R @ vectors[:3] + t[:, :, None] * vectors[3]
 
 
 def point_velocities(R: Array, t: Array, S: Array, points: Array) -> Array:
-    """Return the derivatives (n, p, 3, 3) of the images of points (p, 3) [mm] with respect to d.
+    """Return the derivatives (n, p, 3, 3) of moved points (p, 3) [mm] with respect to d.
 
     Args:
         R: Rotations, shape (n, 3, 3).
@@ -159,8 +159,8 @@ class WeightedEncoding(NamedTuple):
     Attributes:
         d: The most likely jaw parameters [mm], shape (..., 3).
         residual_mm: RMS landmark distance of their pose, shape (...).
-        covariance: Covariance of d [mm^2], shape (..., 3, 3), from the noise of the pose and, if the rig states its own
-            error, from that error as well.
+        covariance: Covariance of d [mm^2], shape (..., 3, 3), from the noise of the pose and, if known, the error of
+            the rig.
     """
 
     d: Array
@@ -186,7 +186,7 @@ class Encoder:
         return d, self.residual_mm(d, T)
 
     def targets(self, T: Array) -> Array:
-        """Return the images (n, 3, 4) of the vectors under poses T_skull_mandible (n, 4, 4), anatomical frame."""
+        """Apply poses T_skull_mandible (n, 4, 4) to the four vectors; return shape (n, 3, 4), anatomical frame."""
         return vector_images(*self._frames.motions(T), self._vectors)
 
     def residual_mm(self, d: Array, T: Array) -> Array:

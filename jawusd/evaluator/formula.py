@@ -91,7 +91,7 @@ def soft_ramp(x: N, softness_mm: float, ops: Operations[N, Table]) -> N:
 
 
 def bent(x: N, ops: Operations[N, Table]) -> N:
-    """Return ``0.15 x^2 / sqrt(1 + x^2 / 16)`` [mm]: a drop that is quadratic near 0 and linear far from it."""
+    """Return ``0.15 x^2 / sqrt(1 + x^2 / 16)`` [mm]: an opening that is quadratic near 0 and linear far from it."""
     square = x * x
     return DROP_BEND * square / ops.sqrt(1.0 + square / DROP_SATURATION_MM2)
 
@@ -132,7 +132,7 @@ def fade(gauge: GaugeNumbers, d1: N, ops: Operations[N, Table]) -> N:
 
 
 def glide(width: int, d2: N, d3: N, tables: Mapping[str, Table], ops: Operations[N, Table]) -> N:
-    """Return the drop [mm] of the glide table at d2, d3 [mm]: the sum of products of ``width`` pairs of curves."""
+    """Return the value [mm] of the glide table at d2, d3 [mm]: the sum of products of ``width`` pairs of curves."""
     side, front = (ops.split(curve(name, x, tables, ops), width) for name, x in (("glide2", d2), ("glide3", d3)))
     total = side[0] * front[0]
     for a, b in zip(side[1:], front[1:]):

@@ -318,7 +318,7 @@ class Gauge:
 
 
 def _next_opening(x: Array, step: Array, low: Array, high: Array, iteration: int) -> Array:
-    """Return the next d1: a Newton step, or the middle of the bracket if the step leaves it or Newton has stalled."""
+    """Return the next d1: a Newton step, or bisection if the step leaves the bracket or Newton has stalled."""
     bounded = np.isfinite(low) & np.isfinite(high)
     late = max(iteration - PATIENCE, 0)
     stride = np.clip(step * 2.0 ** min(late, MAX_DOUBLINGS), -INVERSE_STEP_MM, INVERSE_STEP_MM)

@@ -132,7 +132,7 @@ class NumpyKernels:
         return self._bottom(residual, start)
 
     def solve_ik(self, handles: Handles, targets: Array, start: Array) -> tuple[Array, Array]:
-        """Search inside the bound for the motions that move handles nearest to their targets.
+        """Search inside the bound for the parameters that move handles nearest to their targets.
 
         Args:
             handles: The m points of the mandible.

@@ -147,7 +147,7 @@ class JawRig(RigJudging, RigAuthoring):
         """Return the covariance (..., 6, 6) of the rig's own error at jaw parameters d (..., 3) [mm].
 
         The error is xi = (omega [rad], v [mm]) in the skull frame, with ``T_true = exp(xi) pose(d)``. Its covariance
-        reproduces `landmark_sigma_mm`; it is 0 if the rig does not state these.
+        reproduces `landmark_sigma_mm`; it is 0 if these are unknown.
         """
         rows, batch = as_rows(d, (3,), "d")
         points = transform_points(self.kernels.poses(rows), self.landmarks[None])
@@ -156,7 +156,7 @@ class JawRig(RigJudging, RigAuthoring):
     def parameter_covariance(self, d: ArrayLike) -> Array:
         """Return the covariance (..., 3, 3) [mm^2] of d (..., 3) [mm] that follows from the rig's own error.
 
-        It is 0 if the rig does not state its error.
+        It is 0 if the error is unknown.
         """
         rows, batch = as_rows(d, (3,), "d")
         found, own = np.zeros((len(rows), 3, 3)), self.pose_covariance(rows)

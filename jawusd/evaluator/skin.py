@@ -123,7 +123,7 @@ class Skin:
 
     @property
     def errors_mm(self) -> dict[str, float]:
-        """Mean held-out errors at the incisal point [mm] of "skin" and of guesses; see `fitting.skin.fit_skin`."""
+        """Mean held-out errors at the incisal point [mm] of "skin" and of baselines; see `fitting.skin.fit_skin`."""
         found = self.meta.get("errors_mm")
         named = found.items() if isinstance(found, Mapping) else ()
         return {str(name): float(value) for name, value in named if isinstance(value, int | float)}

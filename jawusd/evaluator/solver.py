@@ -130,7 +130,7 @@ def solve_symmetric(A: Array, b: Array) -> Array:
     c00, c01, c02 = c * f - s * s, q * s - p * f, p * s - q * c
     c11, c12, c22 = a * f - q * q, p * q - a * s, a * c - p * p
     determinant = a * c00 + p * c01 + q * c02
-    # keeps the result finite for a singular matrix; damping corrects the step
+    # keeps the result finite for a singular matrix; if the step is then wrong, damping is increased
     scale = 1.0 / (determinant + (determinant == 0))
     solution = (c00 * x + c01 * y + c02 * z, c01 * x + c11 * y + c12 * z, c02 * x + c12 * y + c22 * z)
     return (np.array(solution) * scale).T.reshape(len(A), 3)

@@ -12,7 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 from jawusd.base.arrays import Array, Mask
 from jawusd.evaluator.formula import ON_BOUND_MM
 
-# Maximum rigidity defect: accepts matrices rounded to 5 decimals or to half precision, rejects sheared or scaled ones.
+# Maximum deviation from a rigid transform: accepts matrices rounded to 5 decimals or to half precision, rejects sheared
+# or scaled ones.
 RIGID_TOLERANCE = 1e-3
 
 INSIDE, OUTSIDE = "inside", "outside"

@@ -70,7 +70,7 @@ def registration_sizes(found: Registration) -> RegistrationSizes:
 class TakeNotes(TypedDict, total=False):
     """Estimates for the whole take, stored in tracks and printed in summaries; pairs are (upper, lower) arch."""
 
-    outline_bias_px: dict[str, list[float]]  # bias of the mask outlines at free tooth edges, by camera
+    outline_bias_px: dict[str, list[float]]  # bias of the mask outlines at tooth edges, by camera
     gum_bias_px: dict[str, list[float]]  # bias of the mask outlines at the gum line, by camera
     # Offset of the gum line in masks from that of the scans, along the surface towards the gum.
     gum_line_mm: list[float]

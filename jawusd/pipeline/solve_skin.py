@@ -56,7 +56,7 @@ class SkinOfShot:
         return range(max(ceil(first), 0), max(floor(last) + 1, 0))
 
     def __call__(self, frames: Array, d: Array, seen: Mask) -> SkinJaw:
-        """Return the jaw of the skin in some frames.
+        """Return the jaw parameters estimated from skin in some frames.
 
         Args:
             frames: frame numbers of the shot, shape (F,).

@@ -38,7 +38,7 @@ def twist_between(start: Array, end: Array, centre: Array) -> Array:
 class OutlineSums(NamedTuple):
     """Sums over matched contour samples per arch and view: weight w, distance d to the mask edge [px], derivative J.
 
-    Annotator bias has three components: at free edges [px], at the gum line in the image [px], and at the gum line
+    Annotator bias has three components: at tooth edges [px], at the gum line in the image [px], and at the gum line
     along the crown surface [mm]. It shifts the outline by their scalar product with h, the last three columns of a
     sample.
 

@@ -21,7 +21,7 @@ def crown_gum_segments(
     """Return the segments in which crown and gum triangles intersect, and directions across them on the crown.
 
     End points [mm] have shape (S, 2, 3). The directions, shape (S, 3), are unit vectors in the crown triangles,
-    perpendicular to the segments. Segments shorter than 1 um are dropped.
+    perpendicular to the segments. Segments shorter than 1 um are omitted.
     """
     if not len(crown_faces) or not len(gum_faces):
         return np.zeros((0, 2, 3)), np.zeros((0, 3))

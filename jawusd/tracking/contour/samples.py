@@ -14,7 +14,7 @@ from jawusd.tracking.contour.scan import CROWN, GUM, Faces, Scan
 
 # Columns of a sample: point in scan coordinates [mm], pixel, outward unit normal in the image, contour length that the
 # sample represents [px], inverse depth [1/mm]; then the effects of annotator bias on the position of the outline along
-# its normal: fraction of free edge and of gum line [-], and motion per mm of gum line moved along the crown surface
+# its normal: fraction of tooth edge and of gum line [-], and motion per mm of gum line moved along the crown surface
 # [px/mm].
 X, Y, Z, U, V, NX, NY, LENGTH, INVERSE_DEPTH, EDGE_SHARE, GUM_SHARE, GUM_SLOPE = range(12)
 COLUMNS = 12
@@ -220,7 +220,7 @@ def _visible(
     px_per_mm: float,
     facing_gum: Array,
 ) -> Array:
-    """Keep samples with their surface just inside and no crown just outside; classify them as free edge or gum line."""
+    """Keep samples with their surface just inside and no crown just outside; classify as tooth edge or gum line."""
     out = np.empty_like(samples)
     height, width = labels.shape
     shows_gum = facing_gum[0] == 0.0 and facing_gum[1] == 0.0

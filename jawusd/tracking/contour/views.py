@@ -63,7 +63,7 @@ class View:
     present: Mask  # whether each of the two masks exists, shape (2,)
     # motion of the arches in the world from the reference camera's exposure to this camera's, shape (2, 4, 4)
     T_delay: Array = field(default_factory=lambda: np.tile(np.eye(4), (2, 1, 1)))
-    # outward mask bias: at free edges [px], at the gum line [px], and along the crown at the gum line [mm]; shape (2,
+    # outward mask bias: at tooth edges [px], at the gum line [px], and along the crown at the gum line [mm]; shape (2,
     # 3)
     habits: Array = field(default_factory=lambda: np.zeros((2, 3)))
     # search for tooth borders by colour, which replaces the masks

@@ -51,7 +51,7 @@ class Setting:
 
 @dataclass(frozen=True, eq=False)
 class Mistake:
-    """A possible mistake, and the setting after correcting it."""
+    """A possible mistake, and the inputs after correcting it."""
 
     kind: str
     message: str

@@ -83,7 +83,7 @@ def pick_findings(given: Setting, seen: Sequence[Seen], masked: Sequence[str], f
 
 @dataclass(frozen=True, eq=False)
 class _Evidence:
-    """How well the picks and masks of a setting agree."""
+    """How well picks and masks agree for given inputs."""
 
     poses: Array  # T_world_upper, T_world_lower, shape (2, 4, 4)
     wrong: Mapping[str, list[int]]  # numbers (from 1) of the rejected picks, by arch

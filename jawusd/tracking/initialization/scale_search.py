@@ -78,7 +78,7 @@ def seen_size(
 
 
 class _Sizes:
-    """Fits the teeth in a calibrated world that is scaled by a factor."""
+    """Aligns the teeth in a calibrated world that is scaled by a factor."""
 
     def __init__(
         self, capture: Capture, cameras: Sequence[Camera], offsets: Mapping[str, int], search: StartSearch

@@ -41,7 +41,7 @@ _NEAR_GRID = Grid(
     reach_mm=(6.0, 6.0, 6.0),
 )
 # Jaw openings [mm] for placing one arch relative to the other, and height and depth [mm] of the hinge axis relative to
-# the front teeth. A single arch also fits when shifted by a tooth, but jaws do not move that way.
+# the front teeth. A single arch also fits when shifted along itself by one tooth, but jaws do not move that way.
 _OPENINGS_MM, _CONDYLES_MM = (0.0, 6.0, 14.0, 24.0, 36.0), (40.0, -90.0)
 _WIDEST_JAW_RAD = 0.8  # maximum rotation between the arches [rad]
 _FARTHEST_JAW_MM = 75.0  # maximum distance between the front teeth of the arches [mm]

@@ -115,7 +115,7 @@ class InstantSolver:
 
 
 def bound_equations(coordinates: Coordinates, d: Array) -> tuple[Array, Array]:
-    """Return normal matrix (9, 9) and right-hand side (9,) of the penalties for poses outside the bound or too closed.
+    """Return normal matrix (9, 9) and right-hand side (9,) of the penalties on poses outside the bound or overclosed.
 
     Outlines of closed teeth fit nearly as well with the lower teeth some millimetres higher, inside the upper teeth.
     """

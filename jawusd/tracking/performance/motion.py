@@ -87,7 +87,7 @@ def head_bends(coordinates: Coordinates, poses: Sequence[Pose]) -> tuple[Array, 
 
 
 def measured_motion(coordinates: Coordinates, poses: Sequence[Pose], good: Mask, fps: float) -> Motion:
-    """Return the variances of a take's motion; if too few frames are good, those of the take behind the rig.
+    """Return the variances of a take's motion; if too few frames are good, those of the rig's training take.
 
     Args:
         poses: poses of consecutive frames.
@@ -113,7 +113,7 @@ def measured_motion(coordinates: Coordinates, poses: Sequence[Pose], good: Mask,
 
 
 def _of_rig(jaw: JawRig, fps: float) -> Array:
-    """Return the mean squared second differences of d in the take behind the rig, scaled to a frame rate."""
+    """Return the mean squared second differences of d in the rig's training take, scaled to a frame rate."""
     bend = np.abs(np.diff(jaw.captured_d, 2, axis=0))
     if len(bend) < _FEWEST_BENDS:
         return _USUAL_JAW

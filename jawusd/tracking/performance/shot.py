@@ -43,13 +43,13 @@ class Shot:
 
     Attributes:
         views: source of the views of each frame.
-        camera_names: in view order.
+        camera_names: names of the cameras, in the order of the views.
         frames: range of reference-camera frames, end exclusive.
         start_frame, start: initial frame and pose.
         fps: frames per second.
         fixed_head: whether the cameras are head-mounted, so that the head pose is constant.
         free_focal: whether to estimate the focal lengths.
-        skin: the jaw by facial skin, if known.
+        skin: jaw parameters estimated from facial skin, if known.
     """
 
     views: Views
@@ -100,7 +100,7 @@ def solve_performance(
 
 
 class _Take:
-    """Fits of all frames."""
+    """A shot being solved; `fits` are the frame fits so far, by frame number."""
 
     def __init__(self, jaw: JawRig, solver: ContourSolver, shot: Shot, progress: Progress) -> None:
         self._jaw, self._config, self._shot, self._progress = jaw, solver.config, shot, progress
@@ -111,7 +111,7 @@ class _Take:
         self.fits: dict[int, FrameFit] = {}
 
     def first_pass(self) -> None:
-        """Align every frame from the start in both directions, and back from frames by which others can be judged."""
+        """Align all frames in both directions from the start; go back over frames where that may correct them."""
         first, stop = self._shot.frames
         start = self._shot.start_frame
         attempts = Attempts(self._quick, self._weight)
@@ -127,7 +127,7 @@ class _Take:
         take.follow(Begin(start, begun, self._walk))
 
     def _walk(self, way: range, near: FrameFit) -> Iterator[FrameFit]:
-        """Yield the fits of frames in tracking order, next to a given fit.
+        """Yield the fits of frames in tracking order, starting next to a given fit.
 
         If frames are followed again, their residuals are compared with those of all frames followed so far.
         """
@@ -184,7 +184,7 @@ def solve_capture(
         config: settings of the tracker.
         fixed_head: whether the cameras are head-mounted, so that the head pose is constant.
         free_focal: whether to estimate the focal lengths, starting from the calibrated ones.
-        skin: the jaw by facial skin, if known.
+        skin: jaw parameters estimated from facial skin, if known.
         threads: number of threads of the start search; the result does not depend on it.
         progress: called after each frame with the number of frames done and the total.
 

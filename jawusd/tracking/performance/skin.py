@@ -1,7 +1,7 @@
 """The factor of facial skin on d, with a slowly varying error that frames with visible teeth reveal.
 
-Skin measures d in each frame as d_skin = d + L u + w, where L L^T is a share of the covariance that the learned map
-states. The slow error u is an Ornstein-Uhlenbeck process with unit variance (Rasmussen and Williams 2006, equation
+Skin measures d in each frame as d_skin = d + L u + w, where L L^T is a fraction of the covariance that the learned map
+predicts. The slow error u is an Ornstein-Uhlenbeck process with unit variance (Rasmussen and Williams 2006, equation
 B.29), which is a Markov chain at equally spaced frames. The fast error w has the rest of the covariance; it persists
 over several frames, so its variance is enlarged accordingly.
 """
@@ -18,8 +18,8 @@ from jawusd.evaluator.skin import SkinJaw
 from jawusd.tracking.performance.attempts import FrameFit
 from jawusd.tracking.performance.system import TakeSystem
 
-#: Function that returns the jaw of the skin in some frames. Arguments: frame numbers, shape (F,); d of the first pass
-#: [mm], shape (F, 3); and whether both arches were found in each frame, shape (F,).
+#: Function that returns the jaw parameters estimated from facial skin in some frames. Arguments: frame numbers, shape
+#: (F,); d of the first pass [mm], shape (F, 3); and whether both arches were found in each frame, shape (F,).
 SkinOf = Callable[[Array, Array, Mask], SkinJaw]
 
 SLOW = 3  # number of unknowns per frame: the slow error in units of its standard deviation
@@ -39,7 +39,7 @@ class SkinFactor:
         """Prepare the factor.
 
         Args:
-            skin: jaw of the skin in every frame.
+            skin: jaw parameters estimated from skin, in every frame.
             fps: frames per second.
             wider: factor on all precisions, if covariances of the system are multiplied by it later.
         """
@@ -52,7 +52,7 @@ class SkinFactor:
         self._keep = float(np.exp(-1.0 / (_SLOW_S * fps)))
 
     def started(self, fits: Sequence[FrameFit]) -> list[FrameFit]:
-        """Return fits with d of the skin in frames in which an arch was not found."""
+        """Return the fits, with d estimated from skin in frames in which an arch was not found."""
         return [
             replace(fit, pose=replace(fit.pose, d=d)) if used and not fit.found.all() else fit
             for fit, d, used in zip(fits, self._d, self.used, strict=True)
@@ -101,7 +101,7 @@ class SkinFactor:
 
 
 def jaw_of_skin(skin: SkinOf | None, frames: Sequence[int], fits: Sequence[FrameFit]) -> SkinJaw | None:
-    """Return the jaw of the skin in the frames of a first pass; None without skin."""
+    """Return the jaw parameters estimated from skin in the frames of a first pass; None without skin data."""
     if skin is None:
         return None
     d = np.stack([fit.pose.d for fit in fits])

@@ -1,4 +1,4 @@
-"""The jaw by facial skin alone, without images of the teeth; the pose of the head is unknown."""
+"""Jaw parameters from facial skin alone, without images of the teeth; the pose of the head is unknown."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ from jawusd.tracking.performance.smoother import Smoother
 def solve_by_skin(jaw: JawRig, scans: Sequence[Scan], skin: SkinOf, frames: range, fps: float) -> Performance:
     """Solve the jaw parameters of every frame from facial skin.
 
-    The head is the world: its pose is the identity, without uncertainty. There are no cameras.
+    The head frame is used as the world frame: the head pose is the identity, without uncertainty. There are no cameras.
 
     Args:
         jaw: the subject's rig.
         scans: prepared scans of the upper and lower teeth.
-        skin: the jaw by facial skin.
+        skin: jaw parameters estimated from facial skin.
         frames: frame numbers.
         fps: frames per second.
     """

@@ -78,7 +78,7 @@ class Smoother:
             length_px: correlation length of outline errors; default: estimated from the residuals.
             annotator: prior on annotator bias; default: of hand-drawn masks.
             wider: ratio of the true to the computed variance of a frame's unknowns.
-            skin: jaw of the skin in every frame, if known.
+            skin: jaw parameters estimated from facial skin in every frame, if known.
         """
         self._wider, self._skin = wider, None if skin is None else SkinFactor(skin, fps, wider)
         self._cameras, self._rounds, self._length_px = cameras, _FOCAL_ROUNDS if free_focal else _ROUNDS, length_px
@@ -204,7 +204,7 @@ class Smoother:
         return replace(fit, solution=solution, growth=growth)
 
     def _found_again(self, fits: list[FrameFit], weight: Array) -> list[FrameFit]:
-        """Align arches that have masks but were not found again, starting from smoothed poses."""
+        """Repeat the alignment of arches that have masks but were not found, starting from smoothed poses."""
         if self._views is None:
             return fits
         attempts = Attempts(self._instants, weight, usual_residual_px(fits))

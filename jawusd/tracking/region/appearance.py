@@ -126,7 +126,7 @@ class LearnedColours:
         """Update the colour models with the colours on both sides of matched borders, and update the gum-line offset.
 
         Args:
-            views: views of the images, with the colour counts of one alignment.
+            views: views of the images, which contain the colour counts of one alignment.
             pictures, poses: images and poses of the same frame.
             rates: learning rates of tooth and background colours, 0 .. 1.
         """

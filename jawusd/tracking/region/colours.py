@@ -12,7 +12,7 @@ from scipy.ndimage import gaussian_filter1d
 from jawusd.base.arrays import Array, Mask
 
 PATCHES = 8  # number of patches per arch
-KINDS = 2  # number of border kinds: free edge and gum line
+KINDS = 2  # number of border kinds: tooth edge and gum line
 TABLES = PATCHES * KINDS  # number of colour tables per arch; table = KINDS * patch + kind
 _BITS = 4  # bits per colour channel; with more bits, most bins would stay empty
 BINS = 1 << (3 * _BITS)
@@ -91,7 +91,7 @@ class CameraColours:
         Args:
             rates: weight of new tooth and of new outside colours, 0 .. 1.
         """
-        # Free edges and gum line of a patch belong to the same teeth, so their tooth colours are pooled.
+        # Tooth edges and gum line of a patch belong to the same teeth, so their tooth colours are pooled.
         both = tooth.reshape(2, PATCHES, KINDS, BINS).sum(2)
         _blend(self._local_tooth.reshape(-1, KINDS, BINS), both.reshape(-1, BINS), rates[0])
         _blend(self._local_outside.reshape(-1, 1, BINS), outside.reshape(-1, BINS), rates[1])

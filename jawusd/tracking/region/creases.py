@@ -71,7 +71,7 @@ def search_creases(
 
 @numba.njit(nogil=True, cache=True, inline="always")
 def _sharpest(line: Array, at: int, steps: int) -> float:
-    """Return the interpolated index of the steepest change near index `at` of a profile; NaN without local maximum."""
+    """Return the interpolated index of the steepest change near index `at` of a profile; NaN if there is none."""
     best, place = 0.0, np.nan
     before, slope = np.nan, np.nan
     first = max(at - steps, _CREASE_ARM)

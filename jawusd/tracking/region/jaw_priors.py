@@ -36,8 +36,8 @@ _SPREAD_MM, _PRODUCTS, _CONSTANT_MM = (0.4, 1.5, 1.5), 0.5, 1.0
 # Standard deviations of the condyles from the polynomials of their own jaw, sideways, upwards and forwards [mm].
 _OFF_MM = (0.3, 0.8, 0.5)
 _NEWS = 0.1  # weight of a frame in the regression: below 1, since neighbouring frames are correlated
-# backward motion of the incisal point per mm of opening and per mm^2 of squared opening: mean over the joints of
-# `_USUAL_MM`
+# backward motion of the incisal point per mm of opening and per mm^2 of squared opening: averaged over the same joints
+# as `_USUAL_MM`
 _BACK = 0.25, 0.005
 # squared Mahalanobis distance per coordinate at which the weight of a frame is halved, since its pose may be wrong [-]
 _HALVING = 4.0

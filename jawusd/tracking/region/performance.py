@@ -44,12 +44,12 @@ _ROUGH_FACES, _FACES, _SAMPLE_STEP_PX, _REDRAW_PX, _SETTLED_MM = 6_000, 20_000, 
 # for focal lengths.
 _FIRST_FRAMES, _FOCAL_ROUNDS = 120, 3
 # Prior on the offsets between colour borders and tooth edges in a take; and correlation length of the residuals along
-# an outline [px]. Teeth darken towards their free edges, where borders lie up to half a pixel inside; gum-line offsets
-# are learned while tracking.
+# an outline [px]. Teeth darken towards their edges, so borders lie up to half a pixel inside; gum-line offsets are
+# learned while tracking.
 _BORDERS = AnnotatorPrior(common=(0.0, 0.0, 0.0), arch=(0.4, 0.08, 0.02), camera=(0.0, 0.0), frames=5.0)
 _CORRELATION_PX = 80.0
 _ALONE = 2.0  # factor on the variance for a single camera [-], since no other view reveals shifted borders
-_OFF_MM = 1.0  # possible error of an unconfirmed pose beside a loss above which the pose is left out
+_OFF_MM = 1.0  # possible error of an unconfirmed pose next to lost frames above which the pose is left out
 _CLEARLY = 1.05  # minimum ratio of matched contour for another pose to replace a trusted one
 
 
@@ -65,7 +65,7 @@ class PictureShot:
         fps: frames per second.
         fixed_head: whether the cameras are head-mounted, so that the head pose is constant.
         free_focal: whether to estimate the focal lengths.
-        skin: the jaw by facial skin, if known.
+        skin: jaw parameters estimated from facial skin, if known.
     """
 
     cuts: Cuts
@@ -191,8 +191,8 @@ class PictureTake:
         """Return the fits of frames, tracked from an initial pose in both directions.
 
         Args:
-            recover: whether to search for the teeth where they stay lost, and to leave out poses beside losses that
-                nothing confirms.
+            recover: whether to search for the teeth where they stay lost, and to leave out unconfirmed poses next to
+                lost frames.
         """
 
         def search(lost: range, near: FrameFit) -> Begin[FrameFit]:

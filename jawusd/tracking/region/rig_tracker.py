@@ -1,4 +1,4 @@
-"""Colour-based tracker of head and jaw of a subject with a known rig; it recovers lost teeth."""
+"""Colour-based tracker of head and jaw of a subject with a known rig; it re-acquires teeth after a loss."""
 
 from __future__ import annotations
 

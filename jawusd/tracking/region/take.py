@@ -61,7 +61,7 @@ def camera_findings(names: Sequence[str], solutions: Iterable[Solution]) -> list
             "camera_rarely_used",
             "warning",
             f"{share[c]:.0%} of the teeth's outlines match this camera's images, compared with {share.max():.0%} for "
-            f"the best camera; at least {_LEAST_SHARE:.0%} of the latter is usual. This camera contributes little.",
+            f"the best camera; at least {_LEAST_SHARE:.0%} of that is usual. This camera contributes little.",
             value=round(float(share[c]), 3),
             limit=round(float(_LEAST_SHARE * share.max()), 3),
             camera=name,
@@ -133,7 +133,7 @@ def footage_findings(tracks: Tracks) -> list[Finding]:
 
 @dataclass(frozen=True, eq=False)
 class TakeFacts:
-    """Everything that describes a take except its frames.
+    """Properties of a take that apply to all its frames.
 
     Attributes:
         cameras: cameras in the order of the views.

@@ -28,9 +28,10 @@ from jawusd.tracking.region.search import InstantViews, PoseSearch, fitting_shar
 from jawusd.tracking.sequence.history import MotionPredictor
 
 _FIRST_ROUNDS = 3  # number of refinements of the start, whose error may be a few tenths of a millimetre
-# Fractions of the usual matched contour below which wider residual gates are tried, the jaw is searched for, a lost
-# arch stays lost, and an arch is lost. The usual matched contour is the median over recent frames, but at least
-# `_LEAST_USUAL` times its value in the first frame, so that slowly closing lips do not redefine it.
+# Fractions of the usual matched contour length below which, in this order, wider residual gates are tried, the jaw is
+# searched for, a lost arch stays lost, and an arch becomes lost. The usual matched contour is the median over recent
+# frames, but at least `_LEAST_USUAL` times its value in the first frame, so that slowly closing lips do not redefine
+# it.
 _UNCERTAIN, _SUSPECT, _AGAIN, _LOST, _LEAST_USUAL = THOROUGH.uncertain, THOROUGH.searched, 0.5, 0.25, 0.7
 _USUAL_FRAMES = 15  # number of recent frames that define the usual matched fraction
 _EAGER, _OFTEN = 6, 4  # a lost arch is searched for in each of the first frames, then in every n-th one; see `_is_due`

@@ -40,7 +40,7 @@ _CREASE_CONTRAST, _CREASE_WEIGHT, _CREASE_REACH_PX = 25.0, 0.5, 7.0
 def choose_tables(
     samples: Array, count: int, labels: NDArray[np.uint8], axes: Array, patches: Array, out: NDArray[np.int64]
 ) -> None:
-    """Write the index of the log-ratio table of each contour sample: nearest patch, and free edge or gum line.
+    """Write the index of the log-ratio table of each contour sample: nearest patch, and tooth edge or gum line.
 
     Args:
         samples: shape (n, COLUMNS); the first `count` are on the silhouette.

@@ -110,7 +110,7 @@ _USUAL_FRAMES = 2000  # number of evenly spaced frames from which the median cov
 
 @dataclass(frozen=True, eq=False)
 class ClosedBite:
-    """Errors measured in frames with closed teeth; twists are (omega [rad], v [mm]) about `point` in scan axes.
+    """Errors measured in frames with the teeth closed; twists are (omega [rad], v [mm]) about `point` in scan axes.
 
     Attributes:
         frames: the frames used.

@@ -111,9 +111,8 @@ class MotionPredictor:
 class SearchBudget:
     """A budget for failed multi-start searches in a take.
 
-    A search takes as long as tracking ten to fifty frames, and wrong masks would trigger a failing search on every
-    frame with wrong masks, both forwards and backwards. Work is counted instead of time, so results do not depend on
-    the machine.
+    A search takes as long as tracking ten to fifty frames, and wrong masks would otherwise trigger a failing search in
+    every affected frame, in both directions. Work is counted instead of time, so results do not depend on the machine.
     """
 
     def __init__(self, frames: int) -> None:

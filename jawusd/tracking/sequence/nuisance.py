@@ -24,12 +24,12 @@ class Nuisances:
     Attributes:
         delays: exposure times relative to the first camera [frames], shape (C,): the image of camera c for a frame was
             taken at time frame + delays[c].
-        habits: outward mask bias, per arch and camera, shape (2, C, 3): at free edges and at the gum line [px at
+        habits: outward mask bias, per arch and camera, shape (2, C, 3): at tooth edges and at the gum line [px at
             working resolution], and along the crown surface at the gum line [mm]; see `OutlineSums`.
         shift_px: the resulting mean shift of edges and gum line, shape (2, C, 2).
         sigma_delays, sigma_habits, sigma_shift_px: standard deviations of these estimates.
         twists, sigma_twists: corrections of the camera poses as in `Extrinsics`, shape (C, 6).
-        contour_px: rms of that part of the contour shift by the twists that poses of the teeth cannot compensate [px].
+        contour_px: rms contour shift caused by the twists, without the part that poses of the teeth compensate [px].
         covariance: covariance of all unknowns in the order of `TakeEquations`, zero where not estimated, shape (U, U).
     """
 

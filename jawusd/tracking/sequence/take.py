@@ -159,7 +159,7 @@ class _Take(Passes):
         return found, extrinsics
 
     def _late_cameras(self, equations: TakeEquations, extrinsics: Extrinsics, rest: RestFrames) -> Nuisances | None:
-        """Correct delays of about one frame in advance; return None without such delays.
+        """Correct delays of about one frame in advance; return None if there are none.
 
         A camera with such a delay also seems to have moved, and its masks seem to be wrong where the jaw is fast.
         """

@@ -133,7 +133,7 @@ def _camera_moved(name: str, turn_deg: float, message: str, hint: str) -> Findin
 
 
 def _bent(name: str, bend: float, limits: LensLimits) -> Finding:
-    """Return a warning about a camera whose magnification changes away from the optical axis."""
+    """Return a warning about a camera whose magnification changes with the distance from the optical axis."""
     if abs(bend) > _MOST_BEND:
         return Finding(
             "side_teeth",
@@ -162,7 +162,7 @@ def _than(share: float) -> str:
 
 
 def _wide(name: str, c: int, found: Magnification, limits: LensLimits) -> list[Finding]:
-    """Return a warning if the masks of a camera are much wider or narrower than those of the others."""
+    """Return a warning if the mask outlines of a camera lie far outside or inside those of the others."""
     own = found.bias_px[c] - np.median(found.bias_px, axis=0)
     bias = float(own.mean())
     if len(found.bias_px) < _TELLING_CAMERAS:
@@ -176,7 +176,7 @@ def _wide(name: str, c: int, found: Magnification, limits: LensLimits) -> list[F
         Finding(
             "masks_wide",
             "warning",
-            f"the masks are {abs(bias):.1f} px {'wider' if bias > 0 else 'narrower'} than those of the other cameras "
+            f"the mask outlines lie {abs(bias):.1f} px {'outside' if bias > 0 else 'inside'} those of the other cameras "
             f"at working resolution; at most {limits.bias_px} px is usual.",
             value=round(bias, 2),
             limit=limits.bias_px,
@@ -222,9 +222,9 @@ def misfit_findings(records: Mapping[int, FrameRecord]) -> list[Finding]:
                 Finding(
                     "scan_misfit",
                     "warning",
-                    f"the {name} scan barely fits its own masks: {share[r]:.0%} of its visible contour matches, "
-                    f"to {rough[r]:.1f} px; of the {ARCH_NAMES[other]} scan, {share[other]:.0%} matches, to "
-                    f"{rough[other]:.1f} px. The poses of the {name} scan are unreliable.",
+                    f"the {name} scan barely fits its own masks: {share[r]:.0%} of its visible contour matches, with "
+                    f"residuals of {rough[r]:.1f} px; for the {ARCH_NAMES[other]} scan, it is {share[other]:.0%}, "
+                    f"with residuals of {rough[other]:.1f} px. The poses of the {name} scan are unreliable.",
                     value=round(100 * float(share[r]), 1),
                     limit=round(100 * _FITS_LESS * float(share[other]), 1),
                     hint=f"Check that the {name} scan is a recent one of this subject, and that its masks show the "
