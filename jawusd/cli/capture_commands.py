@@ -253,7 +253,7 @@ def photos(
     """Register two scans in occlusion, from outlines drawn in photographs of the closed bite.
 
     All photographs must show the same bite and be taken with one camera, whose focal length may be unknown. Some may be
-    taken in a mirror. Exit code 6 if the scans do not fit the outlines.
+    taken via an intraoral mirror. Exit code 6 if the scans do not fit the outlines.
     """
     from jawusd.base.errors import TrackingError
     from jawusd.cli.text_capture import photograph_lines

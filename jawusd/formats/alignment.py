@@ -1,4 +1,4 @@
-"""Face models beside a rig: corresponding points, and the alignment that follows from them; both JSON.
+"""Corresponding points of a face model and a rig, and the alignment computed from them; both JSON.
 
 Correspondences, format jawusd-correspondences/1, are written by hand:
 

@@ -58,7 +58,7 @@ class PickView(Strict):
 
 
 class Pick(Strict):
-    """Picked vertex of a teeth scan, and the pixels at which cameras see it."""
+    """Picked vertex of a teeth scan, and its pixels in the images of several cameras."""
 
     vertex: Annotated[
         int,

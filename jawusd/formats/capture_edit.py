@@ -30,7 +30,7 @@ def write_bootstrap(path: str | os.PathLike[str], picks: Bootstrap, expected: Bo
     check_input(path)
     try:
         data = path.read_bytes()
-        encoding = json.detect_encoding(data)  # detected like in `jawusd.base.tables.read_text`, and kept on writing
+        encoding = json.detect_encoding(data)  # detected as in `jawusd.base.tables.read_text`, and kept on writing
         text = data.decode(encoding)
         found = tomllib.loads(text).get(_TABLE)
         there = None if found is None else Bootstrap.model_validate(found)

@@ -101,7 +101,7 @@ def _problem(value: Path, full: Path, folder: Path, allow_outside: bool) -> tupl
 
 
 def _misnamed(location: Location, full: Path) -> tuple[str, str | None] | None:
-    """Return the problem with the type of a file, and a hint."""
+    """Return what is wrong with the type of a file, and a hint; None if nothing is wrong."""
     key = next((str(part) for part in reversed(location) if isinstance(part, str)), "")
     kind = wrong_kind(key, full)
     return None if kind is None else (kind, f"Choose another file for {key}.")
@@ -110,7 +110,7 @@ def _misnamed(location: Location, full: Path) -> tuple[str, str | None] | None:
 def _named_twice(
     location: Location, full: Path, named: dict[tuple[str, Path], Location], data: Mapping[str, object]
 ) -> tuple[str, str | None] | None:
-    """Return the problem with a scan, clip or mask that another key also names; otherwise record its use."""
+    """Return what is wrong if another key also names a scan, clip or mask, and a hint; otherwise record its use."""
     group = next((str(part) for part in location if part in ("scans", "masks", "video", "videos")), "")
     other = named.setdefault((group, full), location)
     # One label file may contain both arches of a camera.

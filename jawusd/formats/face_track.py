@@ -57,7 +57,7 @@ def read_jaw_track(path: str | os.PathLike[str], joint: tuple[float, float, floa
     """Read the jaw motion of a face model.
 
     Args:
-        joint: jaw joint of the model [model units], if the file does not state it.
+        joint: jaw joint of the model [model units], if the file does not contain it.
 
     Raises:
         FormatError: the file has no jaw motion, an array has a wrong shape, or there is no joint.

@@ -47,7 +47,7 @@ _NOT_READ = {
 _LENGTHS = ("mm", "cm", "m")
 _MAX_BYTES = 1 << 28
 _MOST_FRAMES = 10_000_000
-_OUT_OF_SIGHT = 1e20  # magnitude of coordinates from which a marker is considered hidden
+_OUT_OF_SIGHT = 1e20  # minimum magnitude of a coordinate for a marker to count as hidden
 _INTERPOLATIONS = ("step", "linear", "parabolic", "cubic", "cubicstep", "quadraticstep", "sphericallinear")
 _LEADING_ZERO = re.compile(r"[+-]?0\d+")
 

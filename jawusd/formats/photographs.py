@@ -19,7 +19,7 @@ class AlignedPhoto:
 
     name: str
     size_px: tuple[int, int]
-    mirrored: bool  # whether it was taken in a mirror; poses then refer to the horizontally flipped image
+    mirrored: bool  # whether it was taken via a mirror; poses then refer to the horizontally flipped image
     focal_px: float
     distortion: float  # radial distortion, OpenCV's k1
     middle_px: Array  # principal point, shape (2,)

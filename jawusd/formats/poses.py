@@ -35,7 +35,7 @@ MATRIX_COLUMNS = tuple(f"m{row}{column}" for row in range(4) for column in range
 QUATERNION_COLUMNS = ("tx", "ty", "tz", "qw", "qx", "qy", "qz")
 PARAMETER_COLUMNS = ("d1", "d2", "d3")
 _MAX_BYTES = 1 << 30
-# Maximum rigidity defect of a matrix; matrices written with 5 decimals stay below it.
+# Maximum deviation of a matrix from a rigid transform; matrices written with 5 decimals stay below it.
 _RIGID_TOLERANCE = 1e-3
 _ZERO_QUATERNION = 1e-6
 _SHOWN = 60  # maximum length of a quoted line in messages [characters]

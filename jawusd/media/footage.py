@@ -31,7 +31,7 @@ def open_clip(source: ClipSource | Path) -> Clip:
     source = source if isinstance(source, ClipSource) else ClipSource(source)
     if source.path.is_dir():
         raise CaptureError(
-            "is a folder.", path=source.path, hint=f'Name the images in the folder, such as "{source.path.name}/*.png".'
+            "is a folder.", path=source.path, hint=f'Give the images in the folder, such as "{source.path.name}/*.png".'
         )
     clip: Clip = (
         PictureSequence(source)

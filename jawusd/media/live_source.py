@@ -160,5 +160,5 @@ class LiveSource:
             raise CaptureError(
                 f"cannot be read ({error}).",
                 path=self.where,
-                hint="Name a file, a device such as /dev/video0, or a stream such as rtsp://host/camera.",
+                hint="Give a file, a device such as /dev/video0, or a stream such as rtsp://host/camera.",
             ) from error

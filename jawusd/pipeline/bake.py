@@ -33,8 +33,8 @@ def check_same_jaw(subject: Subject, model: JawModel) -> None:
     apart = np.linalg.norm(model.arrays["landmarks"][:3] - subject.landmarks[:3], axis=1)
     if apart.max() > _TEETH_APART_MM:
         raise RigError(
-            f"the {LANDMARKS[int(apart.argmax())]} of the model is {apart.max():.1f} mm from that of the scans "
-            f"(allowed: {_TEETH_APART_MM:g} mm).",
+            f"the {LANDMARKS[int(apart.argmax())]} of the model is {apart.max():.1f} mm from that of the scans; at "
+            f"most {_TEETH_APART_MM:g} mm is allowed.",
             hint="Scans and the landmarks or poses of the model must share one coordinate frame.",
         )
 

@@ -89,7 +89,7 @@ def convert_cameras(source: Path, out: Path, unit_mm: float, size: Size | None) 
         raise OutputError(
             f'cannot write "{suffix}" files.',
             path=out,
-            hint="Name a .toml (aniposelib), a .usda, or a folder (COLMAP).",
+            hint="Give a .toml (aniposelib), a .usda, or a folder (COLMAP).",
         )
     return cameras, save_colmap(out, cameras)
 
@@ -139,7 +139,7 @@ def _calibrated(capture: Capture) -> list[tuple[Camera, CameraSource]]:
         raise CalibrationError(
             'has no "calibration".',
             path=capture.folder / "capture.toml",
-            hint="Name a calibration file there; `jawusd calibrate` makes one from [boards].",
+            hint="Specify a calibration file there; `jawusd calibrate` makes one from [boards].",
         )
     found = read_calibration(capture.calibration, capture.calibration_unit_mm, lambda: _recorded_sizes(capture))
     # Camera names of other programs may contain dots; names in a capture must not.
@@ -203,7 +203,7 @@ def open_videos(capture: Capture) -> dict[str, Clip]:
         raise CaptureError(
             "no camera has a video.",
             path=capture.folder / "capture.toml",
-            hint="Name the footage there (video = ...).",
+            hint="Specify the footage there (video = ...).",
         )
     return {name: open_clip(clip) for name, clip in sources.items()}
 
@@ -240,7 +240,7 @@ def open_backdrops(capture: Capture, offsets: Mapping[str, int]) -> dict[str, Ba
         raise CaptureError(
             "no camera has a video or masks to draw over.",
             path=capture.folder / "capture.toml",
-            hint="Name the footage there (video = ...).",
+            hint="Specify the footage there (video = ...).",
         )
     return {source.name: Backdrop(source, offsets[source.name]) for source in sources}
 

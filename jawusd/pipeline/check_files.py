@@ -224,7 +224,7 @@ def calibration(parts: Parts) -> Iterator[Finding]:
     if capture.calibration is None:
         if capture.boards is None:
             message = 'has neither "calibration" nor [boards] to make one from'
-            hint = "Name a calibration file, or clips of a calibration board."
+            hint = "Specify a calibration file, or clips of a calibration board."
             yield Finding("no_calibration", "error", message, path=parts.description, hint=hint)
         return
     if not parts.usable(capture.calibration) or not all(parts.clip_read(camera) for camera in capture.cameras):

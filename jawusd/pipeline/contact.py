@@ -76,12 +76,12 @@ def teeth_of(rig: JawRig, meshes: Mapping[str, Mesh]) -> Teeth:
 
     missing = [name for name in TEETH.values() if name not in meshes]
     if rig.contact is None or missing:
-        raise RigError("has no contact of the teeth.", hint="Fit it with scans of both arches in occlusion.")
+        raise RigError("has no tooth contact data.", hint="Fit it with scans of both arches in occlusion.")
     upper, lower = (meshes[TEETH[row]] for row in ("upper", "lower"))
     try:
         return find_teeth(upper, lower, rig.T_anatomical_skull, rig.T_rest)
     except NoContact as reason:
-        raise RigError(f"gives no contact of the teeth: {reason}.") from reason
+        raise RigError(f"does not allow tooth contact to be computed: {reason}.") from reason
 
 
 def tooth_solids(meshes: Mapping[str, Mesh], T_anatomical_skull: Array, T_rest: Array) -> Teeth | str:

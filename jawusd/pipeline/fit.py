@@ -180,7 +180,7 @@ def read_trajectory(
             raise FormatError(
                 "its poses are those of landmarks on the mandible, not of a scan.",
                 path=path,
-                hint="Use --rest-frame to name a frame (counted from 0) with the teeth in occlusion.",
+                hint="Give a frame (counted from 0) with the teeth in occlusion with --rest-frame.",
             )
         frames, T = read_hdf5(path, options.group)
     else:
@@ -248,7 +248,7 @@ def _chosen(groups: list[str], wanted: str | None, path: Path) -> str:
         raise FormatError(
             f"no trajectory is chosen; available trajectories: {known}.",
             path=path,
-            hint="Name one of them with --group." if groups else None,
+            hint="Choose one of them with --group." if groups else None,
         )
     if wanted not in groups:
         raise FormatError(f'has no trajectory "{wanted}"; it has {known}.', path=path)

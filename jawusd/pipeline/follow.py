@@ -164,7 +164,7 @@ class Follower:
         return take.known
 
     def _walk(self, tracker: RegionTracker, cutter: Cutter, way: range, near: RegionPose) -> Iterator[RegionPose]:
-        """Yield the poses of frames in tracking order, next to a given pose; sample the views of some."""
+        """Yield the poses of frames in tracking order, starting next to a given pose; keep the views of some frames."""
         cuts = _Latest(cutter.walk(self._footage, way))
         for frame, found in zip(way, tracker.follow(cuts, near.poses), strict=True):
             if frame in self._wanted and found.found.all():

@@ -203,7 +203,7 @@ def _moved(
 
 def _shape_at(rest_frame: int | None, seen: Array, body: RigidBody, name: str, path: Path) -> Array:
     """Return the positions of the markers of a rigid body in the rest frame."""
-    hint = "Use --rest-frame to name a frame (counted from 0) with the teeth in occlusion and all markers visible."
+    hint = "Give a frame (counted from 0) with the teeth in occlusion and all markers visible with --rest-frame."
     if rest_frame is None:
         raise FormatError(
             f"the positions of the markers on the rigid body of the {name} are unknown.", path=path, hint=hint

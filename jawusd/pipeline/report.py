@@ -174,7 +174,7 @@ def report_build(
         raise FormatError(
             f"is not the folder of a build: it has no {BUILD_FILE}.",
             path=folder,
-            hint="Name the folder that `jawusd build` wrote, or add --experiments for poses.",
+            hint="Give the folder that `jawusd build` wrote, or add --experiments for poses.",
         )
     with locked(folder):
         state = BuildState(folder)

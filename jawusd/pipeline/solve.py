@@ -55,7 +55,7 @@ class SolveSummary(TypedDict):
     focal: NotRequired[
         dict[str, tuple[float, float]]
     ]  # ratio of estimated to calibrated focal length, and its standard deviation, by camera
-    skin_offset_s: NotRequired[float]  # seconds from frame 0 of the shot to that of the face
+    skin_offset_s: NotRequired[float]  # seconds from frame 0 of the shot to frame 0 of the face data
     findings: NotRequired[list[dict[str, str | float | int]]]
 
 
@@ -90,12 +90,12 @@ def solve(
         free_focal: estimate the focal lengths; those of the calibration may then be wrong by up to 10 %.
         jobs: number of threads; the result does not depend on it.
         allow_outside: allow paths in the capture that point outside its folder.
-        skin: facial skin during the shot, which determines d in frames with hidden teeth. With skin, the shot needs no
+        skin: facial skin data of the shot, which determine d in frames with hidden teeth. With them, the shot needs no
             images.
 
     Raises:
-        FormatError, RigError: the rig, or a file of the skin, cannot be read.
-        FittingError: the skin does not belong to the rig or the shot.
+        FormatError, RigError: the rig or a skin file cannot be read.
+        FittingError: the skin data do not belong to the rig or the shot.
         CaptureError, CalibrationError, SyncError: see `track`.
         TrackingError: the teeth cannot be found in the masks or the videos.
         OutputError: a file cannot be written.
@@ -110,7 +110,7 @@ def solve(
     by_skin = None if skin is None else SkinOfShot(jaw, skin, capture.fps)
     if skin is not None and by_skin is not None and (skin.only or not _has_images(capture)):
         if overlay is not None:
-            raise OutputError("needs the pose of the head, which is unknown from skin alone.", path=overlay)
+            raise OutputError("needs the head pose, which cannot be estimated from skin alone.", path=overlay)
         offsets: dict[str, int] = {}
         found, findings = _from_skin(capture, jaw, by_skin)
     else:
@@ -133,7 +133,7 @@ def solve(
 def _from_images(
     capture: Capture, jaw: JawRig, offsets: dict[str, int], options: VideoOptions, progress: Progress
 ) -> tuple[Performance, list[Finding]]:
-    """Return the performance by masks or images of the teeth, and findings about the scans."""
+    """Return the performance solved from masks or images of the teeth, and findings about the scans."""
     from jawusd.tracking.performance.results import tracks_of
     from jawusd.tracking.performance.shot import solve_capture
 
@@ -179,7 +179,7 @@ def _has_images(capture: Capture) -> bool:
 
 
 def _from_skin(capture: Capture, jaw: JawRig, skin: SkinOfShot) -> tuple[Performance, list[Finding]]:
-    """Return the performance by facial skin alone, and findings about the scans."""
+    """Return the performance estimated from facial skin alone, and findings about the scans."""
     from jawusd.tracking.contour.scan import prepare_scan
     from jawusd.tracking.performance.skin_alone import solve_by_skin
 
@@ -243,13 +243,15 @@ def check_output(
     if report is not None:
         check_page(report)
     if overlay is not None and Path(overlay).suffix.lower() != VIDEO:
-        raise OutputError("an overlay is a single video.", path=overlay, hint=f"Name a file ending in {VIDEO}.")
+        raise OutputError("an overlay is a single video.", path=overlay, hint=f"Give a file name ending in {VIDEO}.")
     if out is None:
         return
     if Path(out).suffix.lower() in _USD and Path(rig).suffix.lower() not in _USD:
-        raise RigError("is not a USD rig; an animation layer needs one.", path=rig, hint="Name the rig's actor.usda.")
+        raise RigError("is not a USD rig; an animation layer needs one.", path=rig, hint="Give the rig's actor.usda.")
     if Path(out).suffix.lower() not in SUFFIXES:
-        raise OutputError("has an unsupported suffix.", path=out, hint=f"Name a file ending in {', '.join(SUFFIXES)}.")
+        raise OutputError(
+            "has an unsupported suffix.", path=out, hint=f"Give a file name ending in one of {', '.join(SUFFIXES)}."
+        )
 
 
 def solve_summary(performance: Performance) -> SolveSummary:

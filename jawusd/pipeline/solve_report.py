@@ -36,7 +36,7 @@ def check_page(path: str | os.PathLike[str]) -> None:
     import jawusd.report.solve_page  # noqa: F401
 
     if Path(path).suffix.lower() != PAGE:
-        raise OutputError("the report must be an HTML file.", path=path, hint=f"Name a file ending in {PAGE}.")
+        raise OutputError("the report must be an HTML file.", path=path, hint=f"Give a file name ending in {PAGE}.")
 
 
 def report_solve(
@@ -61,7 +61,7 @@ def report_solve(
         if found.solved is None:
             raise FormatError(
                 "contains tracks that do not come from a solve.",
-                hint="Name the .npz that `jawusd solve` wrote, or the folder of a build.",
+                hint="Give the .npz that `jawusd solve` wrote, or the folder of a build.",
             )
         if capture is None:
             _write(page, found, None, {}, tracks.stem, progress)
@@ -122,7 +122,7 @@ def _write(
 def _rate(tracks: Tracks) -> float:
     rate = tracks.meta.get("fps")
     if not isinstance(rate, float) or not 0 < rate < math.inf:
-        raise FormatError("contains no frame rate.", hint="Name its capture file with --capture.")
+        raise FormatError("contains no frame rate.", hint="Give its capture with --capture.")
     return rate
 
 

@@ -1,4 +1,4 @@
-"""The jaw of a shot by facial skin: read the face, check that it belongs to rig and shot, and align the clocks."""
+"""Jaw motion of a shot from facial skin: read the face data, check that they fit rig and shot, align the clocks."""
 
 from __future__ import annotations
 
@@ -24,18 +24,18 @@ _COMPARED, _FIRST_PASS_MM, _MOST_APART = 20, 0.5, 4.0
 
 
 class SkinOfShot:
-    """The jaw of the frames of a shot by facial skin; a function object for the solver.
+    """Jaw parameters of a shot, estimated from facial skin; a function object for the solver.
 
     Attributes:
-        offset_s: seconds from frame 0 of the shot to that of the face; None until it is estimated.
+        offset_s: seconds from frame 0 of the shot to frame 0 of the face data; None until it is estimated.
     """
 
     def __init__(self, rig: JawRig, options: SkinOptions, fps: float) -> None:
-        """Read map and face; `fps` is the frame rate of the shot [1/s].
+        """Read the map and the face data; `fps` is the frame rate of the shot [1/s].
 
         Raises:
-            FormatError: a file is invalid, the map belongs to another subject, or the face has other columns than those
-                of the map or no frame rate.
+            FormatError: a file is invalid, the map belongs to another subject, or the face data have no frame rate or
+                other columns than the map.
         """
         self._skin = load_own_skin(rig, options.skin)
         face = read_face(options.face, options.fps, options.unit, options.rigid, options.rest_frame)
@@ -47,7 +47,7 @@ class SkinOfShot:
         self.offset_s = options.offset_s
 
     def frames(self) -> range:
-        """Return the frames of the shot that the face covers.
+        """Return the frames of the shot that the face data cover.
 
         Raises:
             FittingError: the offset between the clocks is unknown.
@@ -73,8 +73,8 @@ class SkinOfShot:
         found = self._skin(columns_at(self._face_s + self._known_offset(), self._columns, times))
         if not found.familiar.any():
             raise FittingError(
-                f"{os.fspath(self._face)}: in none of the {len(frames)} frames does the face resemble those from which "
-                "the map was learned.",
+                f"{os.fspath(self._face)}: the face resembles those from which the map was learned in none of the "
+                f"{len(frames)} frames.",
                 hint="Check that face and map have the same unit (--length-unit), that points are relative to the same "
                 "head (--rigid), and the offset of the clocks (--offset).",
             )
@@ -98,8 +98,9 @@ class SkinOfShot:
         apart = float((away**2 / variance).mean())
         if apart > _MOST_APART:
             raise FittingError(
-                f"{os.fspath(self._face)}: in {int(rows.sum())} frames with visible teeth, d of the skin differs from "
-                f"d of the teeth by {np.sqrt((away**2).mean()):.1f} mm (root mean square), {np.sqrt(apart):.1f} times "
+                f"{os.fspath(self._face)}: in {int(rows.sum())} frames with visible teeth, d from the skin differs "
+                f"from d from the teeth by {np.sqrt((away**2).mean()):.1f} mm (root mean square), "
+                f"{np.sqrt(apart):.1f} times "
                 f"the expected error; at most {np.sqrt(_MOST_APART):g} times is accepted.",
                 hint="Check that the face is of this shot, the offset of the clocks (--offset), and that the map was "
                 "learned with this rig and the same points.",
@@ -107,7 +108,7 @@ class SkinOfShot:
 
 
 def check_columns(skin: Skin, face: FaceTable, options: SkinOptions) -> None:
-    """Check that a face has the columns from which a map was learned.
+    """Check that face data have the columns from which a map was learned.
 
     Raises:
         FormatError: number, kind or names of the columns differ.

@@ -40,13 +40,13 @@ class VideoOptions:
 
 @dataclass(frozen=True)
 class SkinOptions:
-    """Input of `solve` about facial skin.
+    """Facial-skin inputs of `solve`.
 
     Attributes:
         skin: the map from skin to d, written by `jawusd skin-fit`.
         face: facial motion during the shot; it has the columns from which the map was learned.
         fps: frame rate of the face [1/s], if the file does not state it.
-        offset_s: seconds from frame 0 of the shot to that of the face; None: estimated.
+        offset_s: seconds from frame 0 of the shot to frame 0 of the face data; None: estimated.
         unit, rigid, rest_frame: see `pipeline.skin.read_face`.
         only: whether to ignore the images of the shot.
     """

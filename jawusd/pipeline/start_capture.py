@@ -53,7 +53,7 @@ def start_capture(folder: Path, square_mm: float | None, fps: float | None, prog
     """
     if not folder.is_dir():
         what = "is a file" if folder.exists() else "there is no such folder"
-        raise CaptureError(f"{what}.", path=folder, hint="Name the folder of footage and scans.")
+        raise CaptureError(f"{what}.", path=folder, hint="Give the folder of footage and scans.")
     files = find_files(folder)
     name = re.sub(r"[^A-Za-z0-9_\-. ]+", "_", folder.resolve().name).strip() or "capture"
     out = CaptureStart(folder / "capture.toml", CaptureSketch(name))

@@ -58,7 +58,7 @@ MISTAKES = [
     ("a model that is none", ["build", ".", "-o", "out", "--model", "linear"], ["linear", "anchored"]),
     ("both of two opposites", ["build", ".", "-o", "empty", "--resume", "--fresh"], ["cal.toml"]),
     ("a folder for init that is none", ["init", "nowhere"], ["there is no such folder"]),
-    ("a video for init", ["init", "left.mp4"], ["is a file", "Name the folder"]),
+    ("a video for init", ["init", "left.mp4"], ["is a file", "Give the folder"]),
     ("a second init", ["init", "."], ["exists already", "--force"]),
     ("two people in one folder", ["init", "two"], ["anna_upper.stl, bob_upper.stl", "a folder is for one subject"]),
     ("one clip to align", ["sync", "left.mp4"], ["left.mp4"]),

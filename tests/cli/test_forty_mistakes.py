@@ -98,7 +98,7 @@ TYPED = [
     ("two people in one folder", ["init", "two"], "", "anna_upper.stl, bob_upper.stl", "one subject", "name one"),
     ("a lens alone", ["cameras", "lens.nk", "-o", "a.toml"], "lens.nk", "no Camera node", "", "Export Project"),
     ("a project of a tracker", ["cameras", "shot.3de", "-o", "a.toml"], "shot.3de", "project", "not supported", "Nuke"),
-    ("cameras to what is not written", ["cameras", "cal.toml", "-o", "a.fbx"], "a.fbx", '".fbx"', "", "Name a .toml"),
+    ("cameras to what is not written", ["cameras", "cal.toml", "-o", "a.fbx"], "a.fbx", '".fbx"', "", "Give a .toml"),
     ("cameras of other names", ["check", "others"], "cal.toml", "left", "contains east, west", ""),
 ]
 

@@ -258,7 +258,7 @@ def test_a_shot_is_solved_from_skin_alone(rig, shot, tmp_path):
 def test_files_with_other_names_are_refused_before_any_work(rig, shot, tmp_path):
     for option, name in (("--overlay", "take.avi"), ("--report", "take.pdf")):
         said = run("solve", rig, shot, "-o", tmp_path / "take.csv", option, tmp_path / name, code=10)
-        assert "Name a file ending in" in said
+        assert "Give a file name ending in" in said
     (tmp_path / "take.mp4").write_text("precious")
     assert "--force" in run("solve", rig, shot, "-o", tmp_path / "t.csv", "--overlay", tmp_path / "take.mp4", code=10)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["take.mp4"]

@@ -94,5 +94,5 @@ def test_skin_that_contradicts_the_teeth_is_refused(shot):
     rig, options, frames, true, seen = shot
     with pytest.raises(FittingError, match="in none of the 500 frames.*--length-unit"):
         SkinOfShot(rig, replace(options, unit="cm", offset_s=LATE_S), FPS)(frames, true, seen)
-    with pytest.raises(FittingError, match="frames with visible teeth, d of the skin differs.*--offset"):
+    with pytest.raises(FittingError, match="frames with visible teeth, d from the skin differs.*--offset"):
         SkinOfShot(rig, replace(options, offset_s=LATE_S + 1.5), FPS)(frames, true, seen)

@@ -61,6 +61,6 @@ def test_meshes_that_do_not_meet_give_a_message_and_no_traceback(tmp_path):
     _, running, quiet = page_of(tmp_path, touching_rig())
     try:
         quiet.enter(quiet.page.contacts.shown, True)
-        assert "gives no contact of the teeth" in quiet.page.contacts.text.content
+        assert "does not allow tooth contact to be computed" in quiet.page.contacts.text.content
     finally:
         running.stop()

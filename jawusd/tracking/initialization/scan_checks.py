@@ -99,7 +99,7 @@ def _impossible(found: Occlusion) -> Iterator[Finding]:
     off = "the upper and lower teeth scans are not in occlusion: "
     if found.same > _SAME_SHARE:
         message = f"the upper and lower teeth scans are the same arch: {found.same:.0%} of their surfaces coincide"
-        yield error("scans_same", message, found.same, _SAME_SHARE, "Name the other arch's file in [scans].")
+        yield error("scans_same", message, found.same, _SAME_SHARE, "Specify the other arch's file in [scans].")
     if found.opposite < _BESIDE_SHARE and found.turn_rad < _FACING_BACK_RAD:
         message = f"{off}the arches are {found.aside_mm:.0f} mm apart sideways; only {found.opposite:.0%} of the "
         message += f"smaller one overlaps the other in the bite plane; at least {_BESIDE_SHARE:.0%} is needed"

@@ -286,7 +286,7 @@ def check_registration(found: Registration) -> None:
             f"the teeth are {shift:.1f} mm and {turn:.1f} degrees off the bite of the scans; at most {_MOST_MM:g} mm "
             f"and {_MOST_DEG:g} degrees can be a registration error",
             frame=found["frames"][0],
-            hint="Name a frame with the teeth together as rest_frame in [motion], or register the scans again.",
+            hint="Set rest_frame in [motion] to a frame with the teeth together, or register the scans again.",
         )
 
 

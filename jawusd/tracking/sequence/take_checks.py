@@ -176,8 +176,8 @@ def _wide(name: str, c: int, found: Magnification, limits: LensLimits) -> list[F
         Finding(
             "masks_wide",
             "warning",
-            f"the mask outlines lie {abs(bias):.1f} px {'outside' if bias > 0 else 'inside'} those of the other cameras "
-            f"at working resolution; at most {limits.bias_px} px is usual.",
+            f"the mask outlines lie {abs(bias):.1f} px {'outside' if bias > 0 else 'inside'} those of the other "
+            f"cameras at working resolution; at most {limits.bias_px} px is usual.",
             value=round(bias, 2),
             limit=limits.bias_px,
             camera=name,
