@@ -299,8 +299,8 @@ def _checked(T: Array, name: str, path: Path) -> Array:
     if defect.size and defect.max() > _RIGID_TOLERANCE:
         row = int(present[defect.argmax()])
         raise FormatError(
-            f'group "{name}", row {row + 1}: the pose is not rigid (defect {defect.max():.2g}, allowed '
-            f"{_RIGID_TOLERANCE:g}).",
+            f'group "{name}", row {row + 1}: the pose is not rigid (deviation {defect.max():.2g}; '
+            f"at most {_RIGID_TOLERANCE:g} is allowed).",
             path=path,
         )
     return T
