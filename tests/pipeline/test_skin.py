@@ -170,7 +170,7 @@ def test_a_face_of_another_performance_is_refused(take):
     face = read_face_of(X[np.random.default_rng(1).permutation(len(X))] + noise)
     with pytest.raises(FittingError, match="does not follow the jaw at any clock offset"):
         learn_skin(person.rig, jaw, face)
-    with pytest.raises(FittingError, match="no frame shows all columns"):
+    with pytest.raises(FittingError, match="no frame has values in all columns"):
         learn_skin(person.rig, jaw, read_face_of(np.where(np.arange(40)[:, None] == 3, np.nan, X)))
     with pytest.raises(ValueError, match="frame rate"):
         learn_skin(person.rig, jaw.at_rate(0.0), face)
