@@ -159,7 +159,7 @@ def _check_distances(names: tuple[str, ...], X: Array, Y: Array, sigma: Array, s
     median = float(np.median(distance_mm / sigma))
     if median > _LARGEST_MEDIAN:
         raise FittingError(
-            f"half of the points are more than {median:.1f} standard deviations off; at most {_LARGEST_MEDIAN:g} is "
+            f"the median distance of the points is {median:.1f} standard deviations; at most {_LARGEST_MEDIAN:g} is "
             f"accepted. Distances after the fit [mm]: {listed}.",
             hint=_HINT,
         )

@@ -183,7 +183,7 @@ def _check_take(rig: JawRig, weights: Array, d: Array, times_s: Array) -> None:
     if reach[worst] < _LEAST_REACH:
         raise FittingError(
             f"the take covers {max(reach[worst], 0.0):.0%} of the range of {_DIRECTIONS[worst]}; "
-            f"{_LEAST_REACH:.0%} is needed to learn the mapping.",
+            f"at least {_LEAST_REACH:.0%} is needed to learn the mapping.",
             hint="Record wide opening, both sides and forward, teeth together and apart, for half a minute.",
         )
     still = np.ptp(weights, axis=0) == 0

@@ -179,11 +179,11 @@ def _read(path: Path) -> dict[str, StageRecord[Mapping[str, object]]]:
 def _record(found: Mapping[str, object]) -> StageRecord[Mapping[str, object]]:
     inputs, outputs, seconds, result = (found[name] for name in ("inputs", "outputs", "seconds", "result"))
     if not (isinstance(inputs, str) and isinstance(outputs, dict) and isinstance(result, dict)):
-        raise ValueError("inputs must be text, outputs and result must be tables")
+        raise ValueError("inputs must be text; outputs and result must be tables")
     for name, value in outputs.items():
         place = PurePosixPath(name)
         if place.is_absolute() or ".." in place.parts or not _SHA256.fullmatch(str(value)):
-            raise ValueError(f'outputs name "{name}", which is not a file inside the folder with a hash')
+            raise ValueError(f'outputs contain "{name}", which is outside the folder or has no valid hash')
     if not isinstance(seconds, int | float) or not math.isfinite(float(seconds)):
         raise ValueError("seconds must be a finite number")
     return StageRecord(inputs, outputs, float(seconds), result)

@@ -109,7 +109,7 @@ def write_animation(
 
 
 def note_unseen(layer: Sdf.Layer, carried: ArrayLike, by_skin: ArrayLike) -> None:
-    """List the frames (F,) whose d was not measured in the layer's `customLayerData`; see `write_animation`."""
+    """Write the frames (F,) whose d was not measured to the layer's `customLayerData`; see `write_animation`."""
     for key, frames in ((CARRIED, carried), (SKIN, by_skin)):
         if len(np.atleast_1d(frames)):
             layer.customLayerData = {**layer.customLayerData, key: _gf.int_array(np.floor(np.asarray(frames)))}
@@ -257,7 +257,7 @@ def write_splines(
     if tangents.shape != d.shape or len(cubic) != max(len(frames) - 1, 0):
         raise ValueError(f"expected slopes (F, 3) and curved (F - 1,), got {tangents.shape} and {cubic.shape}")
     if not len(frames) or not np.isfinite(d).all() or not (np.diff(frames) > 0).all():
-        raise RigError("keys need increasing frames and finite values.", path=out)
+        raise RigError("keys must have increasing frames and finite values.", path=out)
     layer = new_layer(fps, f"/{root_prim_of(Path(animation))}")
     layer.startTimeCode, layer.endTimeCode = float(frames[0]), float(frames[-1])
     stage = stage_of(layer)

@@ -115,7 +115,7 @@ CHECKSUMS = "sha256"
 
 
 def record_checksums(layer: Sdf.Layer, folder: Path, names: Iterable[str]) -> None:
-    """Record the checksums of files in an anonymous layer that will be written to the same folder."""
+    """Write the checksums of files in a folder to an anonymous layer that will be saved in this folder."""
     sums = {name: _sha256(folder / name) for name in names}
     layer.customLayerData = {**layer.customLayerData, CHECKSUMS: sums}
 

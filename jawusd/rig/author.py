@@ -68,7 +68,7 @@ def _with_ordered_fields(layer: Sdf.Layer) -> Sdf.Layer:
 
 
 def _define_proxy_class(layer: Sdf.Layer, proxies: Iterable[str]) -> None:
-    """Define the class with the proxies under new names. A binary layer stores equal arrays once."""
+    """Define the class with the proxies under new names; binary layers store the equal arrays only once."""
     Sdf.CopySpec(layer, ACTOR, layer, _PROXY_CLASS)  # the copy includes the materials to which the meshes are bound
     layer.GetPrimAtPath(_PROXY_CLASS).specifier = Sdf.SpecifierClass
     mandible = layer.GetPrimAtPath(MANDIBLE.replace(ACTOR, _PROXY_CLASS))

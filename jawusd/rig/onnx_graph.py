@@ -151,7 +151,7 @@ class Graph:
         return b_x, c_x
 
     def _near_and_far(self, squared: Value) -> tuple[Value, Value, list[Value]]:
-        """Return a mask of small squared angles, angles clipped for the closed forms, and the values of the series.
+        """Return a mask of small squared angles, squared angles clipped for the closed forms, and values of the series.
 
         Both branches are evaluated everywhere and must not overflow, because infinity times 0 is NaN.
         """
@@ -189,7 +189,7 @@ class Graph:
         return triple(self.parts(factors[0] @ weights, 3))
 
     def lookup(self, x: Value, knots: Array, tables: Sequence[Array]) -> list[tuple[Value]]:
-        """Return the row (n, k) of each table whose index is the number of knots (m, 1) at or below x.
+        """Return from each table the row (n, k) whose index is the number of knots (m, 1) at or below x.
 
         The row is computed as a matrix product: row 0 plus, for each knot at or below x, the difference of two
         consecutive rows.

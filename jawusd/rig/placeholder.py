@@ -62,7 +62,7 @@ class Estimate:
 
 
 def with_estimated_bones(rig: JawRig, meshes: Mapping[str, Mesh]) -> tuple[dict[str, Mesh], Estimate | None]:
-    """Return the meshes of a rig with a mandible and, if neither bone is given, a skull; None if nothing was missing.
+    """Return the meshes with an estimated mandible, and skull if neither bone is given; None if a mandible was given.
 
     Args:
         meshes: As for `bake_rig`; upper teeth and skull in the skull frame, the others in the mandible frame [mm].
@@ -84,7 +84,7 @@ def with_estimated_bones(rig: JawRig, meshes: Mapping[str, Mesh]) -> tuple[dict[
 
 
 def _placed(bone: Mesh, T_anatomical_frame: Array) -> Mesh:
-    """Return a bone of the anatomical frame in another frame, without its colours."""
+    """Transform a bone from the anatomical frame to another frame, and remove its colours."""
     return replace(bone, vertices=transform_points(se3_inverse(T_anatomical_frame), bone.vertices), colors=None)
 
 

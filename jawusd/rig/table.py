@@ -1,7 +1,8 @@
 """The sampled decoder (a table of twists for readers without the exact model), its error, and random samples of d.
 
-The error of linear interpolation over a step h is h^2 / 8 times the second derivative. A grid whose density is the
-square root of the curvature therefore spreads the error evenly (de Boor, A Practical Guide to Splines, chapter XII).
+The error of linear interpolation over a step h is h^2 / 8 times the second derivative. A grid whose density is
+proportional to the square root of the curvature therefore spreads the error evenly (de Boor, A Practical Guide to
+Splines, chapter XII).
 """
 
 from __future__ import annotations

@@ -267,7 +267,7 @@ def _is_intact(layer: Sdf.Layer) -> bool:
         samples = layer.GetNumTimeSamplesForPath(path) if path.IsPropertyPath() else 0
         if count > MAX_SPECS or samples > MAX_SAMPLES:
             found = f"{MAX_SPECS} prims and properties" if count > MAX_SPECS else f"{MAX_SAMPLES} samples of {path}"
-            raise RigError(f"has more than {found:.200}, the maximum.", path=layer.identifier)
+            raise RigError(f"has more than {found:.200}, which is the maximum.", path=layer.identifier)
 
     layer.Traverse(Sdf.Path.absoluteRootPath, visit)
     return not missing

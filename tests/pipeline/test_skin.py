@@ -168,7 +168,7 @@ def test_a_face_of_another_performance_is_refused(take):
     jaw = JawTake(np.arange(len(d)) * 1.0, d, seen, np.full(d.shape, 0.15), 24.0)
     noise = np.random.default_rng(0).normal(size=X.shape)
     face = read_face_of(X[np.random.default_rng(1).permutation(len(X))] + noise)
-    with pytest.raises(FittingError, match="does not follow the jaw at any clock offset"):
+    with pytest.raises(FittingError, match="do not follow the jaw at any clock offset"):
         learn_skin(person.rig, jaw, face)
     with pytest.raises(FittingError, match="no frame has values in all columns"):
         learn_skin(person.rig, jaw, read_face_of(np.where(np.arange(40)[:, None] == 3, np.nan, X)))

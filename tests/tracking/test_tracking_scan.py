@@ -129,7 +129,7 @@ def test_green_counts_as_crown():
 
 def test_scan_with_too_few_faces_is_refused():
     box = trimesh.creation.box((1.0, 1.0, 1.0))
-    with pytest.raises(TrackingError, match="upper teeth scan: 12 tooth faces; at least 100"):
+    with pytest.raises(TrackingError, match="upper teeth scan has 12 tooth faces; at least 100"):
         prepare_scan(Mesh(box.vertices, box.faces), "upper")
 
 

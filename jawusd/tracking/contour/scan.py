@@ -121,7 +121,7 @@ def prepare_scan(mesh: Mesh, name: str) -> Scan:
     gum_faces = np.ascontiguousarray(faces[~crown & solid])
     if len(crown_faces) < _FEWEST_CROWN_FACES:
         raise TrackingError(
-            f"{name} teeth scan: {len(crown_faces)} tooth faces; at least {_FEWEST_CROWN_FACES} are needed",
+            f"the {name} teeth scan has {len(crown_faces)} tooth faces; at least {_FEWEST_CROWN_FACES} are needed",
             hint="Check the scan file, and the faces that `jawusd scans` labels as crown.",
         )
     scan = _with_tables(name, vertices, crown_faces, gum_faces, painted)

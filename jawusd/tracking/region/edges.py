@@ -21,7 +21,7 @@ _LEAST_CLEAR = 0.15  # fraction of `clear_ratio` below which an edge is rejected
 # minimum and maximum motion blur that is compensated; gamma of the images
 _LEAST_BLUR_PX, _MOST_BLUR_PX, _GAMMA = 1.0, 10.0, 2.2
 _SMOOTH_PX = 1.0  # half the width over which image gradients are computed [px]
-_PER_CODE = 8  # entries of the linearisation table per 8-bit step
+_PER_CODE = 8  # number of entries of the linearisation table per 8-bit step
 _LIGHT = (np.arange(255 * _PER_CODE + 1) / (255 * _PER_CODE)) ** _GAMMA
 
 
@@ -167,7 +167,7 @@ def _likeliest(r: Array, n: int, step: float, reach_px: float) -> int:
 
 @numba.njit(nogil=True, cache=True, inline="always")
 def _zero_crossing(r: Array, n: int, step: float, k: int) -> float:
-    """Return the position at which the log ratio falls below 0 near index k [px]; without one, the position of k."""
+    """Return the position near index k at which the log ratio falls below 0 [px]; that of k if there is none."""
     d = (k - n) * step
     near = np.inf
     for m in range(k - 2, k + 2):

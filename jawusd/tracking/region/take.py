@@ -107,7 +107,7 @@ def _longest_run(good: NDArray[np.bool_]) -> tuple[int, int]:
 
 
 def footage_findings(tracks: Tracks) -> list[Finding]:
-    """Return a warning if in too many frames the jaw is lost, or its position uncertain by more than a millimetre.
+    """Return a warning if the jaw is lost, or its position uncertain by more than 1 mm, in too many frames.
 
     The finding's kind is "footage_doubtful".
     """
