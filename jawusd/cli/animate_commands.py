@@ -338,8 +338,8 @@ def _by_skin(rig: JawRig, shapes: BlendShapes, source: Path, path: Path) -> Arra
     _check_actor(rig, skin.actor, path)
     if skin.meta.get("names") != list(shapes.names):
         raise FormatError(
-            f"has {len(shapes.names)} blend shapes; {path.name} was learned from {skin.columns} columns with different "
-            "names or in a different order.",
+            f"has {len(shapes.names)} blend shapes; {path.name} was learned from {skin.columns} columns, whose names "
+            "or order differ.",
             path=source,
         )
     return skin(shapes.weights).d

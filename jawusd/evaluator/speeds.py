@@ -16,8 +16,8 @@ _MIN_FRAMES = 30  # minimum number of fourth differences for an estimate
 # the variance of white noise.
 _NOISE_IN = {1: 2.0, 2: 6.0, 4: 70.0}
 _SIGMA_OF_MEDIAN = 1.4826  # ratio of standard deviation to median absolute value of a normal distribution
-_MIN_SIGNAL = 0.05  # minimum fraction of the observed variance that is attributed to motion
-_MIN_SPREAD = 1e-6  # minimum relative variance in any direction; keeps covariances of one-dimensional motion invertible
+_MIN_SIGNAL = 0.05  # Minimum fraction of the observed variance that is attributed to motion.
+_MIN_SPREAD = 1e-6  # Minimum relative variance in any direction; keeps covariances of 1-D motion invertible.
 
 
 @dataclass(frozen=True, eq=False)

@@ -85,7 +85,7 @@ def align(
         [sigma_mm[name] if isinstance(sigma_mm, Mapping) else sigma_mm for name in names], dtype=np.float64
     )
     if X.shape != Y.shape or X.shape[1:] != (3,) or not np.isfinite([X, Y]).all() or not (unit_mm > 0):
-        raise ValueError("every point needs three finite numbers, and unit_mm must be above 0")
+        raise ValueError("every point must have three finite numbers, and unit_mm must be above 0")
     if not (np.isfinite(sigma) & (sigma > 0)).all():
         raise ValueError("sigma_mm must be finite and above 0 for every point")
     _check_spread(Y, sigma)
@@ -123,8 +123,8 @@ def _check_names(names: tuple[str, ...], target: Mapping[str, ArrayLike]) -> Non
         )
     if len(names) < _FEWEST:
         raise FittingError(
-            f"there are {len(names)} points ({', '.join(names) or 'none'}); at least {_FEWEST} are needed, not on a "
-            "line, such as incisor, molar_left and molar_right.",
+            f"there are {len(names)} points ({', '.join(names) or 'none'}); at least {_FEWEST} that do not lie on a "
+            "line are needed, such as incisor, molar_left and molar_right.",
         )
 
 
@@ -154,7 +154,7 @@ def _check_distances(names: tuple[str, ...], X: Array, Y: Array, sigma: Array, s
         if (np.minimum(z, _OUTLIER) * z).sum() - exchanged > _EXCHANGED:
             raise FittingError(
                 f"the points fit better with left and right exchanged. Distances after the fit [mm]: {listed}.",
-                hint="Left is the left of the subject.",
+                hint="Left is the subject's left.",
             )
     median = float(np.median(distance_mm / sigma))
     if median > _LARGEST_MEDIAN:

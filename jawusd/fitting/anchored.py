@@ -62,8 +62,8 @@ _GUIDED_SHARE = 0.08
 class CondylarGuidance:
     """Learned paths of the left and right condyle, in the anatomical frame."""
 
-    incisor: Array  # lower incisal point at rest [mm], shape (3,)
-    centres: Array  # kinematic centres at rest [mm], shape (2, 3)
+    incisor: Array  # Lower incisal point at rest [mm], shape (3,).
+    centres: Array  # Kinematic centres at rest [mm], shape (2, 3).
     slopes: Array  # polynomial coefficients of the height as a function of the slide, shape (2, 4) [mm]
     slide_range: Array  # range of the captured slides [mm], per condyle, shape (2, 2)
     shift: Array  # coefficients of the sideways movement of the condyles' midpoint [mm], shape (5,)

@@ -25,7 +25,8 @@ _ROTATION_MAX_DEG = 57.0
 _CONDYLE_MAX_MM = 32.0
 _CONDYLES_APART_MM = (70.0, 140.0)
 _QUANTILE = 99.5
-_SAME_FRAME = 0.01  # maximum difference of rotation matrices if the coordinate frame came from the landmarks
+# Maximum difference of rotation matrices for a coordinate frame to count as derived from the landmarks.
+_SAME_FRAME = 0.01
 
 _UNITS = {"metres": 1000.0, "centimetres": 10.0, "inches": 25.4, "micrometres": 1e-3}  # length of each unit in mm
 

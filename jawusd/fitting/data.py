@@ -91,8 +91,8 @@ class TrainingData:
 
     frames: NDArray[np.int64]
     motion: Array  # motions away from the closed bite, anatomical frame, shape (N, 4, 4)
-    weights: Array  # weight of each pose, 0 .. 1, shape (N,)
-    incisor: Array  # lower incisal point in the closed bite, anatomical frame [mm], shape (3,)
+    weights: Array  # Weight of each pose, 0 .. 1, shape (N,).
+    incisor: Array  # Lower incisal point in the closed bite, anatomical frame [mm], shape (3,).
     landmarks: Array  # all landmarks in the closed bite, anatomical frame [mm], shape (5, 3)
     metric: MandibleMetric  # metric of pose differences, in the anatomical frame
 
@@ -224,7 +224,8 @@ def _check(frames: NDArray[np.int64], T: Array) -> None:
     if defect.max() > _RIGID:
         worst = int(defect.argmax())
         raise FittingError(
-            f"the pose of frame {frames[worst]} is not rigid (off by {defect[worst]:.2g}; at most {_RIGID:g} allowed).",
+            f"the pose of frame {frames[worst]} is not rigid (deviation {defect[worst]:.2g}; at most {_RIGID:g} is "
+            "allowed).",
             hint="Poses must be 4x4 rotation and translation without scale or mirroring.",
         )
 

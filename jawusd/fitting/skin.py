@@ -45,8 +45,10 @@ _CHIN_POINTS = 3
 # Maximum ratio of the prediction error to that of each baseline. Observed: at most 0.4 for 12 subjects, at least 1.0
 # when face data are paired with the wrong frames.
 _MOST_SHARE = 0.65
-_CLOCK_COMPONENTS = 12  # number of principal components of the face data used to estimate its clock offset
-_LEAST_EXPLAINED = 0.5  # minimum fraction of the variance of opening and laterotrusion that they must explain
+_CLOCK_COMPONENTS = 12  # Number of principal components of the face data used to estimate its clock offset.
+_LEAST_EXPLAINED = (
+    0.5  # Minimum fraction of the variance of opening and laterotrusion that these components must explain.
+)
 _NAMES = ("opening", "laterotrusion", "protrusion")
 
 

@@ -188,7 +188,7 @@ def _check_weights(weights: Array, shapes: list[int], table: TextTable) -> None:
 def _seconds_and_frame(code: str, named: str, path: Path) -> tuple[int, float]:
     found = _TIMECODE.fullmatch(code)
     if found is None:
-        raise FormatError(f'{named}: "{code}" is not HH:MM:SS:FF.fff.', path=path)
+        raise FormatError(f'{named}: "{code}" is not of the form HH:MM:SS:FF.fff.', path=path)
     hours, minutes, seconds = (int(part) for part in found.groups()[:3])
     return 3600 * hours + 60 * minutes + seconds, float(found[4].replace(",", "."))
 

@@ -84,7 +84,7 @@ def frame_of_timecode(text: str, fps: float) -> int:
     """
     found = _CODE.fullmatch(text.strip())
     if found is None:
-        raise CaptureError(f'the time code "{text:.40}" is not HH:MM:SS:FF.')
+        raise CaptureError(f'the time code "{text:.40}" is not of the form HH:MM:SS:FF.')
     hours, minutes, seconds, frame = (int(found[k]) for k in (1, 2, 3, 5))
     number = math.ceil(fps - 0.01)
     if hours >= _HOURS_PER_DAY or minutes > 59 or seconds > 59 or frame >= number:

@@ -140,7 +140,7 @@ class SolvedJaw:
         for name, shape in _shapes(len(self.d)).items():
             value = np.asarray(getattr(self, name))
             if value.shape != shape:
-                raise ValueError(f"solved.{name} has shape {value.shape}, expected {shape}")
+                raise ValueError(f"solved.{name} has shape {value.shape}; expected {shape}")
             found[_PREFIX + name] = value
         return found
 

@@ -183,7 +183,7 @@ def save_tracks(path: str | os.PathLike[str], tracks: Tracks) -> None:
     for name, shape in _shapes(len(tracks.frames), len(tracks.camera_names)).items():
         value = np.asarray(getattr(tracks, name))
         if value.shape != shape:
-            raise ValueError(f"tracks.{name} has shape {value.shape}, expected {shape}")
+            raise ValueError(f"tracks.{name} has shape {value.shape}; expected {shape}")
         arrays[name] = value
     arrays |= tracks.solved.arrays() if tracks.solved else {}
     meta = {

@@ -118,7 +118,7 @@ def write_take(capture: Capture, tracks: Tracks, folder: Path) -> list[Path]:
 
 
 SHAPES = ("JawOpen", "JawLeft", "JawRight", "JawForward")
-_WEIGHTS = (0.5, 1.0)  # shape weights in the table; two, because the joint does not move linearly with the weight
+_WEIGHTS = (0.5, 1.0)  # shape weights in the table: two, because the joint does not move linearly with the weight
 
 
 def joint_deltas(rig: JawRig, mapping: ArkitMapping | None = None) -> list[JointDelta]:

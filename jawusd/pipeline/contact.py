@@ -31,8 +31,8 @@ class ContactSummary(TypedDict, total=False):
 
     missing: str  # reason why contact was not measured
     closed_mm: float  # penetration depth of the scans with the teeth closed
-    error_mm: float  # maximum error of the clearances
-    limit_mm: float  # smallest clearance of captured poses; poses with less clearance count as collisions
+    error_mm: float  # Maximum error of the clearances.
+    limit_mm: float  # Smallest clearance of captured poses; poses with less clearance count as collisions.
 
 
 def contact_pictures(model: JawModel, subject: Subject) -> tuple[ContactPicture, ...]:

@@ -277,13 +277,13 @@ def _poses(held: dict[str, Array | None], name: str, path: Path) -> Array:
     if rotations is None or t is None:
         raise FormatError(f'group "{name}" has no "rotations".', path=path)
     if t.ndim != 2 or t.shape[1] != 3:
-        raise FormatError(f'group "{name}": "translations" has shape {t.shape}, expected (N, 3).', path=path)
+        raise FormatError(f'group "{name}": "translations" has shape {t.shape}; expected (N, 3).', path=path)
     count = len(t)
     if rotations.shape == (count, 3, 3):
         return make_transform(rotations, t)
     if rotations.shape != (count, 4):
         raise FormatError(
-            f'group "{name}": "rotations" has shape {rotations.shape}, expected ({count}, 4) or ({count}, 3, 3).',
+            f'group "{name}": "rotations" has shape {rotations.shape}; expected ({count}, 4) or ({count}, 3, 3).',
             path=path,
         )
     norm = np.linalg.norm(rotations, axis=1)

@@ -44,8 +44,8 @@ class SolveSummary(TypedDict):
     frames: int
     solved: int
     carried: list[tuple[int, int]]  # runs of frames, as (first, last), in which an arch is occluded
-    skin: list[tuple[int, int]]  # runs of frames, as (first, last), in which d is estimated from facial skin
-    lost: list[tuple[int, int]]  # runs of frames, as (first, last), in which no pose fits the images
+    skin: list[tuple[int, int]]  # Runs of frames, as (first, last), in which d is estimated from facial skin.
+    lost: list[tuple[int, int]]  # Runs of frames, as (first, last), in which no pose fits the images.
     within_tolerance: int  # number of frames outside the bound, but within the tolerance of measured poses
     outside: int  # number of frames outside the bound by more than the tolerance
     cameras: list[str]

@@ -120,7 +120,7 @@ def check_columns(skin: Skin, face: FaceTable, options: SkinOptions) -> None:
     kinds = ["columns", "coordinates of points"]
     raise FormatError(
         f"has {count} {kinds[face.X.ndim == 3]}; {os.fspath(options.skin)} was learned from {skin.columns} "
-        f"{kinds[skin.points]}, which must have the same names and order.",
+        f"{kinds[skin.points]}, and both must have the same names and order.",
         path=options.face,
         hint="Learn the map again from the points of this file with `jawusd skin-fit`.",
     )

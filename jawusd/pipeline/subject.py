@@ -43,8 +43,8 @@ class LabelledScan:
     """A teeth scan with the origin of its labels."""
 
     arch: str  # "upper" or "lower"
-    path: Path  # file of the scan
-    mesh: Mesh  # with labels, unless painted
+    path: Path  # File of the scan.
+    mesh: Mesh  # With labels, unless painted.
     origin: Origin
     labels: ScanLabels | None  # None if the scan is painted
     shape: Labelling | None  # result of labelling by shape, if the scan had neither paint nor labels

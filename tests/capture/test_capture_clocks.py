@@ -123,7 +123,7 @@ def test_clocks_that_tell_nothing(tmp_path):
     with pytest.raises(SyncError, match="according to its timecode, starts 216 frames after camera a"):
         raise_with_place(tmp_path, clips)
     clips["b"]["timecode"] = "noon"
-    with pytest.raises(SyncError, match=r'the time code "noon" is not HH:MM:SS:FF'):
+    with pytest.raises(SyncError, match=r'the time code "noon" is not of the form HH:MM:SS:FF'):
         raise_with_place(tmp_path, clips)
 
 

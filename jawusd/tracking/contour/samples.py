@@ -24,7 +24,7 @@ HABITS = slice(EDGE_SHARE, COLUMNS)  # annotator bias shifts outlines by samples
 # boundaries of painted labels are blurred, since brushes are half a millimetre wide.
 _GUM_FAR_MM, _GUM_NEAR_MM = 1.0, 0.55
 # For scans without gum: cosines to the gum direction at which an outline starts to count as gum line, and at which it
-# counts fully [-]. Only biting edges are certainly free of gum, since papillae hide the sides of crowns.
+# counts fully [-]. Only incisal edges and cusps are certainly free of gum, since papillae hide the sides of crowns.
 _LEAST_FACING, _FULL_FACING = -0.6, -0.2
 # Two samples are on the same outline if they lie within `_BESIDE_PX` and the cosine between their normals is at least
 # `_SAME_WAY`. The inner sample is dropped if the outer one is farther out by `_OUTSIDE_PX` plus `_OUTSIDE_SLOPE` times

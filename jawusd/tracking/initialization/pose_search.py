@@ -23,7 +23,7 @@ from jawusd.tracking.contour.scan import CROWN, Scan, prepare_scan
 from jawusd.tracking.contour.views import View
 
 _CELL_MM = 1.2  # size of the cells in which vertices are merged [mm]
-# blur of the outlines [mm]: with it, the coarse grid does not miss the optimum
+# blur of the outlines [mm], which keeps the coarse grid from missing the optimum
 _BLUR_MM = 0.9
 # Penalty per mm^2 of uncovered mask, in mm of matched outline [1/mm].
 _UNCOVERED_PRICE = 1.0

@@ -24,8 +24,8 @@ LARGEST_SIGMA = np.r_[[0.3] * 3, [30.0] * 3, [10.0] * 3]
 # Matched contour below which an arch is rejected [px]: 2 mm of tooth edge. Tracking without a rig requires a longer
 # contour.
 _LEAST_MATCHED_PX = 15.0
-_FEWEST_MASKS = 2  # minimum number of masks that an arch must fit if another mask is left out
-_TYPICAL_PX = 0.4  # typical residual of hand-drawn masks at the working resolution [px]
+_FEWEST_MASKS = 2  # Minimum number of masks that an arch must fit if another mask is left out.
+_TYPICAL_PX = 0.4  # Typical residual of hand-drawn masks at the working resolution [px].
 
 
 @dataclass(frozen=True, eq=False)

@@ -24,8 +24,8 @@ from jawusd.tracking.performance.views import PRIOR_LOG_FOCAL, with_focal
 class TakeState:
     """Current estimate of the unknowns of a take."""
 
-    layers: Array  # annotator bias in the layers of `Unknowns`, shape (n,)
-    habits: Array  # mask biases per arch and camera, shape (2, C, 3); see `View.habits`
+    layers: Array  # Annotator bias in the layers of `Unknowns`, shape (n,).
+    habits: Array  # Mask biases per arch and camera, shape (2, C, 3); see `View.habits`.
     log_focal: Array  # logarithm of the ratio of true to calibrated focal length, shape (C,)
 
     def corrected(self, views: Sequence[View]) -> list[View]:

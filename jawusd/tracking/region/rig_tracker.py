@@ -35,7 +35,7 @@ _FIRST_ROUNDS = 3  # number of refinements of the start, whose error may be a fe
 # Fractions of the usual matched contour length below which an arch becomes lost, and below which a lost arch stays
 # lost.
 _LOST, _AGAIN = 0.33, 0.5
-# number of frames since the last step above which an arch must fit as well as a recovered one
+# number of frames since the last step above which an arch must fit as well as after a loss
 _UNSURE_FRAMES = 3.0
 _USUAL_FRAMES = 15  # number of recent frames that define the usual matched fraction
 # lower bound of the usual matched fraction, relative to the first frame

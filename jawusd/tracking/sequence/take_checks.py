@@ -246,9 +246,9 @@ def search_findings(searches: SearchBudget, records: Mapping[int, FrameRecord]) 
         Finding(
             "searches_left_out",
             "warning",
-            f"{searches.fruitless} searches for lost teeth failed, which is the limit for a take of this length (at "
-            f"most {searches.most} more failures than successes); in {len(lost)} frames, of which this is the first, "
-            "lost teeth were not searched for.",
+            f"{searches.fruitless} searches for lost teeth failed; for a take of this length, the limit is "
+            f"{searches.most} more failures than successes. Lost teeth were not searched for in {len(lost)} frames, "
+            "beginning with this one.",
             value=len(lost),
             limit=searches.most,
             frame=lost[0],
