@@ -46,9 +46,7 @@ _CHIN_POINTS = 3
 # when face data are paired with the wrong frames.
 _MOST_SHARE = 0.65
 _CLOCK_COMPONENTS = 12  # Number of principal components of the face data used to estimate its clock offset.
-_LEAST_EXPLAINED = (
-    0.5  # Minimum fraction of the variance of opening and laterotrusion that these components must explain.
-)
+_LEAST_EXPLAINED = 0.5  # Minimum fraction of the variance of opening and laterotrusion that these must explain.
 _NAMES = ("opening", "laterotrusion", "protrusion")
 
 
