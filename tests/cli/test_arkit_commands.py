@@ -95,7 +95,7 @@ def test_animate_takes_what_skin_fit_learned_from_blend_shapes(actor, tmp_path):
     assert np.abs(got - d).max() < 0.6 and np.abs(got - d).mean() < 0.1
     csv.write_text(csv.read_text().replace("JawLeft", "MouthLeft"))
     words = ("animate", actor, "--arkit", csv, "--mapping", skin, "-o", tmp_path / "x.usdc")
-    assert "different names" in run(*words, code=3)
+    assert "names or order differ" in run(*words, code=3)
 
 
 def test_arkit_table_lists_shapes(actor, tmp_path):

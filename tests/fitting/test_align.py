@@ -99,7 +99,7 @@ def test_points_that_cannot_be_aligned_are_refused(heads):
     middle = np.mean(transform_points(head.rig.T_rest, head.rig.landmarks)[1:3], axis=0)
     line = {**two, "middle": 0.5 * (two["molar_left"] + two["molar_right"])}
     refused("on a line", line, {"middle": middle}, sigma_mm=1.0)
-    refused("standard deviations off", marked, at, unit_mm=100.0)
+    refused("the median distance of the points", marked, at, unit_mm=100.0)
     swapped = {name: marked[name.replace("left", "RIGHT").replace("right", "left").lower()] for name in marked}
     refused("left and right exchanged", swapped, at)
     for wrong in ({"sigma_mm": 0.0}, {"unit_mm": -1.0}, {"sigma_mm": np.nan}):
