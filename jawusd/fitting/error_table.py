@@ -5,11 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from scipy.optimize import linprog
-from scipy.sparse import eye_array, hstack
 from scipy.spatial import cKDTree
 
-from jawusd.base.arrays import Array, Mask
+from jawusd.base.arrays import Array
 from jawusd.evaluator.models import JawModelForm
 from jawusd.fitting.data import FittedForm, TrainingData
 from jawusd.geometry import LANDMARKS, transform_point
@@ -18,9 +16,12 @@ Refit = Callable[[TrainingData], FittedForm]
 #: Mean, median, p95, max [mm] and number of frames, by landmark or "mandible".
 ErrorTable = dict[str, dict[str, float]]
 
-# Fraction of errors below two standard deviations; above 95 %, since new exercises are farther away.
-_INSIDE_TWO_SD = 0.97
-_SLOWEST_GROWTH = 0.01  # minimum growth of errors with distance [mm/mm], used even if held-out errors do not grow
+# Fraction of held-out errors, weighted by distance, that are below their quantile at the expected growth; and this
+# quantile relative to the rms error for three normally distributed coordinates.
+_BELOW, _LARGEST_RMS = 0.9, 1.443
+_USUAL_GROWTH = 0.5  # growth of errors per mm of distance, relative to the rms error of training frames [1/mm]
+_SLOWEST_GROWTH = 0.01  # minimum growth of errors with distance [mm/mm]
+_SMALLEST_MM = 1e-6  # smaller distances are treated as this distance
 
 
 def pose_errors(data: TrainingData, model: Array) -> dict[str, Array]:
@@ -59,32 +60,32 @@ def seen_errors(data: TrainingData, form: FittedForm) -> dict[str, ErrorTable]:
 
 
 def unseen_errors(
-    data: TrainingData, kept: Mask, folds: int, refit: Refit, notify: Callable[[int], None]
+    data: TrainingData, form: FittedForm, folds: int, refit: Refit, notify: Callable[[int], None]
 ) -> tuple[ErrorTable, dict[str, dict[str, float]], Array]:
     """Cross-validate: hold out contiguous parts of a take in turn, refit, and measure the error on the held-out parts.
 
     Args:
-        kept: frames whose errors count, shape (N,); these are the frames that the fit to all frames did not trim.
+        form: the fit to all frames; only the errors of frames that it did not trim count.
         notify: called with the index of each part before it is processed.
 
     Returns:
         The error table; the growth of the errors with the distance of a pose's parameters from the training poses: for
-        each landmark and the mandible, sd = base_mm + per_mm * captured_distance, such that 97 % of the held-out errors
-        are below two sd; and the rms landmark error of every held-out frame [mm], shape (n,).
+        each landmark and the mandible, rms error = base_mm + per_mm * captured_distance; and the rms landmark error of
+        every held-out frame [mm], shape (n,).
     """
     fold = np.arange(len(data)) * folds // len(data)
     errors, distances = [], []
     for k in range(folds):
         notify(k)
-        seen, unseen = data.select(fold != k), data.select((fold == k) & kept)
+        seen, unseen = data.select(fold != k), data.select((fold == k) & form.kept)
         if not len(unseen):
             continue
-        form = refit(seen)
-        errors.append(_errors(unseen, form))
-        distances.append(_distance(form.model, seen.select(form.kept), unseen))
+        part = refit(seen)
+        errors.append(_errors(unseen, part))
+        distances.append(_distance(part.model, seen.select(part.kept), unseen))
     pooled = {name: np.concatenate([part[name] for part in errors]) for name in errors[0]}
-    distance = np.concatenate(distances)
-    growth = {name: _growth(distance, values) for name, values in pooled.items()}
+    distance, trained = np.concatenate(distances), _errors(data.select(form.kept), form)
+    growth = {name: _growth(distance, values, trained[name]) for name, values in pooled.items()}
     rms = np.sqrt(np.mean([pooled[name] ** 2 for name in LANDMARKS], axis=0))
     return summarise(pooled), growth, rms
 
@@ -99,14 +100,14 @@ def _distance(model: JawModelForm, seen: TrainingData, unseen: TrainingData) -> 
     return cKDTree(captured[np.isfinite(captured).all(1)]).query(np.nan_to_num(wanted))[0]
 
 
-def _growth(distance: Array, errors: Array) -> dict[str, float]:
-    """Fit half the 97 % quantile of errors by an increasing linear function of distance (Koenker & Bassett 1978)."""
-    count = len(errors)
-    above, below = np.full(count, _INSIDE_TWO_SD), np.full(count, 1 - _INSIDE_TWO_SD)
-    cost = np.concatenate([[0.0, 0.0], above, below])
-    # The matrices are sparse, since two dense identity matrices for 20,000 frames would need 6 GB.
-    one = eye_array(count, format="csc")
-    equal = hstack([np.column_stack([np.ones(count), distance]), one, -one], format="csc")
-    limits = [(0, None), (_SLOWEST_GROWTH, None)] + [(0, None)] * (2 * count)
-    found = linprog(cost, A_eq=equal, b_eq=errors / 2, bounds=limits, method="highs")
-    return {"base_mm": float(found.x[0]), "per_mm": float(found.x[1])}
+def _growth(distance: Array, errors: Array, seen: Array) -> dict[str, float]:
+    """Return the rms error of training frames, and its growth with distance such that most held-out errors are below.
+
+    With few frames the growth is uncertain, so it is averaged on a logarithmic scale with a multiple of the rms error.
+    """
+    base = float(np.sqrt(np.mean(seen**2)))
+    slopes = np.maximum(errors / _LARGEST_RMS - base, 0.0) / np.maximum(distance, _SMALLEST_MM)
+    weights = np.maximum(distance, _SMALLEST_MM)
+    found = float(np.quantile(slopes, _BELOW, weights=weights, method="inverted_cdf"))
+    usual = _USUAL_GROWTH * base
+    return {"base_mm": base, "per_mm": max(float(np.sqrt(max(found, 0.0) * usual)), _SLOWEST_GROWTH)}

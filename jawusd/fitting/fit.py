@@ -196,7 +196,7 @@ def _errors(
     seed = form.notes.get("seed")
     again = replace(config, starts=1, seed=seed if isinstance(seed, int) else config.seed)
     tables["holdout"], uncertainty, rms_mm = unseen_errors(
-        data, form.kept, config.holdout_folds, lambda part: forms[config.method](part, shown, again), notify
+        data, form, config.holdout_folds, lambda part: forms[config.method](part, shown, again), notify
     )
     return tables, uncertainty, rms_mm
 

@@ -1,5 +1,7 @@
 """The default model on synthetic persons whose joints are independent of its form."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
@@ -95,6 +97,18 @@ def test_predicted_uncertainty_covers_errors_on_unseen_exercises(person, model, 
     assert min(inside) >= 0.9 and np.mean(inside) <= 0.985
 
 
+@pytest.mark.parametrize("seed", [3, 4, 5])
+def test_predicted_uncertainty_of_a_short_take_is_neither_zero_nor_dominated_by_a_few_frames(seed):
+    subject = Person(seed)
+    model = fit(subject, record(subject, 96, seed).T_noisy, FittingConfig())
+    short, hidden = JawRig(model.arrays, model.meta), record(subject, 300, seed + 10, "hidden").T_noisy
+    d = short.encode(hidden)[0]
+    near = short.pose(d)
+    points = [transform_point(near, point) - transform_point(hidden, point) for point in subject.landmarks]
+    ratio = np.linalg.norm(points, axis=-1).T / short.landmark_sigma_mm(d)
+    assert np.all(np.abs(np.log(np.sqrt((ratio**2).mean(0)))) < np.log(3.5))
+
+
 def test_left_out_frames_are_left_out(person, take):
     anatomy = SubjectAnatomy.of(make_transform(np.eye(3), -person.landmarks[0]), person.landmarks, None, None)
     data = select_poses(np.arange(300), take[:300], anatomy).data
@@ -106,7 +120,8 @@ def test_left_out_frames_are_left_out(person, take):
 
     kept = np.ones(300, bool)
     kept[10:20] = False
-    table, _, _ = unseen_errors(data, kept, 3, refit, lambda fold: None)
+    form = replace(fit_pca(data, np.ones(3, bool)), kept=kept)
+    table, _, _ = unseen_errors(data, form, 3, refit, lambda fold: None)
     for fold, frames in enumerate(seen):
         np.testing.assert_array_equal(frames, np.setdiff1d(np.arange(300), np.arange(100 * fold, 100 * fold + 100)))
     assert table["mandible"]["frames"] == 290

@@ -28,7 +28,7 @@ _ROUNDS = 2
 # number of rounds if focal lengths are unknown, since they are strongly coupled with the distance of the head
 _FOCAL_ROUNDS = 6
 #: Ratio of true to computed variance of a frame's unknowns [-]: the equations ignore that outline errors persist over
-#: frames and that the rig deviates from the subject's anatomy.
+#: frames.
 WIDER = 1.5**2
 # Standard deviations of the prior for aligning frames again in which an arch was missed [rad, mm, mm].
 _NEARBY = np.r_[[0.05] * 3, [3.0] * 3, [3.0] * 3]
