@@ -43,7 +43,7 @@ class Alignment:
 
     reference: str  # camera whose frame numbers are used for all cameras
     cameras: dict[str, Offset]  # offset of each camera, in the order of the capture
-    method: str = "light flash"  # One of "light flash", "sound", "time code" and "picture numbers".
+    method: str = "light flash"  # One of "light flash", "sound", "time code" and "frame numbers".
     notes: tuple[str, ...] = ()  # Remarks on the clips for the user.
 
     @property
@@ -73,7 +73,7 @@ def estimate_offsets(capture: Capture) -> Alignment:
                 hint=_offsets_hint([camera.name for camera in capture.cameras]),
             )
     if capture.sync.method in ("timecode", "numbers"):
-        by = "time code" if capture.sync.method == "timecode" else "picture numbers"
+        by = "time code" if capture.sync.method == "timecode" else "frame numbers"
         offsets, notes = offsets_by_clock(capture)
         return Alignment(capture.reference, offsets, by, notes)
     found = align_videos(videos, capture.reference, by_light=capture.sync.method != "audio")

@@ -1,4 +1,4 @@
-"""Synchronisation by time code and by picture numbers."""
+"""Synchronisation by time code and by frame numbers."""
 
 from fractions import Fraction
 
