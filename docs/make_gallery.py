@@ -1,8 +1,9 @@
-"""Make the pictures of docs/gallery.md: python docs/make_gallery.py [out] [--only NAME ...] [-o FOLDER]
+"""Make the pictures of docs/gallery: python docs/make_gallery.py [out] [--only NAME ...] [-o FOLDER]
 
 `out` is the folder of `jawusd build examples/capture -o out`. A picture whose program is not installed is named and
-left as it was: `viewer`, `pose_page` and `jaw` want Chromium and playwright, `blender` the environment blender45 of
-`tests/interop/make_environments.py` in the folder that JAWUSD_INTEROP names. `face_solver` takes minutes.
+left as it was: `viewer`, `pose_page`, `phone`, `report` and `jaw` want Chromium and playwright, `blender` the
+environment blender45 of `tests/interop/make_environments.py` in the folder that JAWUSD_INTEROP names. `face_solver`
+takes minutes. The charts of the guides are in gallery_charts.py.
 """
 
 import argparse
@@ -14,7 +15,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -22,12 +23,14 @@ import numpy as np
 from matplotlib.figure import Figure
 from PIL import Image, ImageDraw, ImageFont
 
+sys.path.insert(0, str(Path(__file__).parent))
+from gallery_charts import CHARTS, capture_of, incisal_point, run_jawusd
+
 import jawusd
 from jawusd.evaluator import JawRig
 from jawusd.formats.capture import load_capture
 from jawusd.formats.mesh import DEEP, TOUCHING
 from jawusd.formats.tracks import load_tracks
-from jawusd.geometry import transform_point
 from jawusd.media.overlay import placed_scans
 from jawusd.media.writers import VideoWriter
 from jawusd.paper.figures import condyle_figure
@@ -56,6 +59,11 @@ JAW_FROM_MM, JAW_AIM_MM = np.array([132.0, 0.0, 205.0]), np.array([0.0, -34.0, 0
 KEYS_SHOWN = ((0.05, (0, 0, 0)), (0.25, (28, 0, 0)), (0.45, (12, 6, 1)), (0.62, (2, -5, 1)), (0.8, (18, 2, 3)))
 DRAWN_MS = 700  # until a pose is drawn without a graphics card
 PATIENCE_MS = 120_000  # for the page of the viewer, drawn without a graphics card
+
+
+FOOTAGE_FRAMES = 20, 60  # of the example capture
+# Function that makes a picture from the folder of a build, in a folder.
+Picture = Callable[[Path, Path], Path]
 
 
 class NotInstalledError(Exception):
@@ -100,12 +108,6 @@ def border(rig: JawRig, openings: int = 60, ways: int = 72) -> np.ndarray:
         inside = rig.is_inside(start + middle * way)[..., None]
         near, far = np.where(inside, middle, near), np.where(inside, far, middle)
     return start + near * way
-
-
-def incisal_point(rig: JawRig, d: np.ndarray) -> np.ndarray:
-    """Return where the lower incisal point is, from the closed bite to the left, up and forward [mm]."""
-    A = rig.T_anatomical_skull
-    return transform_point(A @ rig.pose(d), rig.landmarks[0]) - transform_point(A @ rig.T_rest, rig.landmarks[0])
 
 
 def envelope(out: Path, folder: Path) -> Path:
@@ -213,6 +215,40 @@ def pose_page(out: Path, folder: Path) -> Path:
     return save_webp(folder / "pose_page.webp", Image.open(io.BytesIO(picture)), 1200)
 
 
+def report(out: Path, folder: Path) -> Path:
+    """Photograph the top of the report of a build."""
+    with browser_page((1200, 900)) as page:
+        page.goto((out / "report.html").resolve().as_uri())
+        page.wait_for_timeout(DRAWN_MS)
+        picture = page.screenshot()
+    return save_webp(folder / "report.webp", Image.open(io.BytesIO(picture)), 1100)
+
+
+def phone(out: Path, folder: Path) -> Path:
+    """Photograph the page of `jawusd view --page` as a phone shows it."""
+    with tempfile.TemporaryDirectory() as made, browser_page((390, 780)) as page:
+        write_page(out, Path(made) / "jaw.html")
+        page.goto((Path(made) / "jaw.html").as_uri())
+        page.wait_for_selector("#jaw[data-clearance]", state="attached")
+        page.locator('[data-jaw="d1"]').evaluate("(e) => { e.value = 16; e.dispatchEvent(new Event('input')); }")
+        page.wait_for_timeout(DRAWN_MS)
+        picture = page.screenshot()
+    return save_webp(folder / "phone.webp", Image.open(io.BytesIO(picture)), 390)
+
+
+def footage(out: Path, folder: Path) -> Path:
+    """Draw the teeth that are tracked in the example's footage without its masks."""
+    with tempfile.TemporaryDirectory() as made:
+        capture_of(Path(made) / "footage", FOOTAGE_FRAMES, 3, masks=False)
+        run_jawusd("track", Path(made) / "footage", "-o", Path(made) / "tracks.npz")
+        capture, tracks = load_capture(Path(made) / "footage"), load_tracks(Path(made) / "tracks.npz")
+        offsets, scans = sync_cameras(capture, no_progress)["offsets"], tracked_scans(capture, tracks)
+        with contextlib.closing(open_wall(capture, offsets, tracks, scans, (400, 300))) as wall:
+            row = len(tracks.frames) - 1
+            picture = wall.draw(int(tracks.frames[row]), placed_scans(tracks, row, scans), fill=0.0)
+    return save_webp(folder / "footage.webp", Image.fromarray(picture), 1200)
+
+
 def viewer(out: Path, folder: Path) -> Path:
     """Photograph the page of `jawusd view`, a pose with the teeth apart."""
     with viewed(out, (1440, 900)) as (_, page):
@@ -275,8 +311,13 @@ def blender(out: Path, folder: Path, frames: int = FRAMES) -> Path:
     return path
 
 
-_MADE = (overlay, envelope, contacts, condyles, viewer, pose_page, jaw, face_solver, blender)
-PICTURES = {made.__name__: made for made in _MADE}
+def chart(draw: Callable[[Path], Figure]) -> Picture:
+    """Return the function that makes the picture of a chart."""
+    return lambda out, folder: save_webp(folder / f"{draw.__name__}.webp", drawn(draw(out)), 1100)
+
+
+_MADE = (overlay, envelope, contacts, condyles, viewer, pose_page, phone, report, jaw, footage, face_solver, blender)
+PICTURES: dict[str, Picture] = {made.__name__: made for made in _MADE} | {draw.__name__: chart(draw) for draw in CHARTS}
 
 
 def main() -> int:

@@ -222,9 +222,56 @@ def bound():
     return svg(680, 304, "A section of the bound in d2 and d3, with one point inside and one outside", parts)
 
 
+def frames():
+    """Draw the anatomical frame at the upper incisal point, and the origin of image coordinates."""
+    parts = [smooth([(40, 60), (70, 44), (120, 52), (200, 62), (262, 74)]), *teeth(176, 72, 5, False)]
+    parts += [arrow((266, 100), (266, 20), "one"), text(276, 26, "y, up", "start")]
+    parts += [arrow((266, 100), (352, 100), "three"), text(330, 122, "z, forward", "start")]
+    parts += [circle(266, 100, 7, "line"), *(path([(261, y), (271, 200 - y)], "two") for y in (95, 105))]
+    parts += [text(256, 128, "x, to the left,", "end", "small"), text(256, 144, "away from the viewer", "end", "small")]
+    parts.append(text(284, 92, "upper incisal point", "start", "small"))
+    parts.append(text(200, 214, "anatomical frame, from the right"))
+    for i in range(4):
+        for j in range(3):
+            parts.append(box(470 + 40 * i, 60 + 40 * j, 40, 40, "soft" if (i + j) % 2 else "line", 0))
+    parts += [circle(490, 80, 4, "fill2"), text(470, 48, "(0, 0): centre of the first pixel", "start", "small")]
+    parts += [arrow((490, 80), (566, 80), "two"), text(572, 85, "x", "start")]
+    parts += [arrow((490, 80), (490, 156), "two"), text(490, 172, "y"), text(560, 214, "pixels of an image")]
+    return svg(680, 232, "Axes at the upper incisal point: left, up, forward; pixels count from their centres", parts)
+
+
+def threshold():
+    """Draw how one threshold was chosen: the values of valid takes, those with a planted fault, and the gap."""
+    x = lambda value: 40 + 30 * value  # noqa: E731
+    parts = [path([(x(0), 110), (x(20), 110)])]
+    for value in range(0, 21, 5):
+        parts += [path([(x(value), 110), (x(value), 116)]), text(x(value), 132, str(value), "middle", "small")]
+    parts += [box(x(0), 70, x(5.2) - x(0), 40, "area", 0), text(x(2.6), 60, "13 valid takes: at most 5.2")]
+    parts += [box(x(13.6), 70, x(19) - x(13.6), 40, "soft", 0), text(x(16.3), 60, "3 knocked cameras: 13.6 to 19")]
+    parts += [path([(x(8), 30), (x(8), 110)], "two"), text(x(8), 22, "threshold 8: the camera was knocked")]
+    parts.append(text(340, 158, "motion of a camera since its calibration [standard deviations]"))
+    return svg(680, 172, "A threshold between the values of valid takes and those of takes with a fault", parts)
+
+
+def shot():
+    """Draw the layers of a shot: the layer of rebake over the animation, over the rigs."""
+    rows = (
+        ("shot.usda", "the shot: what it holds wins over its sublayers"),
+        ("jaws.usdc", "jawusd rebake: d and the mandible agree, inside the bound"),
+        ("anim_take.usdc", "jawusd animate: d and plain transforms, frame by frame"),
+        ("actor.usda", "the rig: meshes, model, bound"),
+    )
+    parts = [arrow((20, 190), (20, 24)), text(34, 18, "stronger", "start", "small")]
+    for k, (name, words) in enumerate(rows):
+        y = 30 + 42 * k
+        parts += [box(40, y, 170, 32, "area" if k == 1 else "soft"), text(125, y + 21, name)]
+        parts.append(text(228, y + 21, words, "start", "small"))
+    return svg(680, 206, "Layers of a shot, the strongest on top: shot, jaws of rebake, animation, rig", parts)
+
+
 FIGURES = {
     "cameras": cameras, "exercises": exercises, "masks": masks, "board": board, "parameters": parameters,
-    "stages": stages, "bound": bound,
+    "stages": stages, "bound": bound, "frames": frames, "threshold": threshold, "shot": shot,
 }  # fmt: skip
 
 if __name__ == "__main__":

@@ -32,7 +32,14 @@ OpenUSD, if it runs before the first stage is opened. Other programs find it thr
 
 Matrices are stored row by row and act on column vectors; a twist is (omega [rad], v [mm]). The column "array" names the
 same values in `model.npz` and in `rig.arrays`. Attributes marked "anchored" or "additive" belong to one kind of
-[model](../explanation/model.md).
+[model](../explanation/model.md). An attribute is read like this:
+
+```python
+from pxr import Usd
+
+actor = Usd.Stage.Open("out/anim_capture.usdc").GetDefaultPrim()
+opening_mm = actor.GetAttribute("jaw:d1").Get(20)  # at frame 20
+```
 
 """
 

@@ -40,8 +40,9 @@ def near(picture, color, within=24.0):
     return float((np.abs(picture - np.array(color)).max(axis=-1) < within).mean())
 
 
-def test_the_page_shows_every_picture_and_each_has_its_function(gallery):
-    shown = re.findall(r"gallery/(\w+)\.(?:webp|mp4)", (ROOT / "docs" / "gallery.md").read_text())
+def test_pages_show_every_picture_and_each_has_its_function(gallery):
+    pages = "".join(path.read_text() for path in (ROOT / "docs").rglob("*.md"))
+    shown = set(re.findall(r"gallery/(\w+)\.(?:webp|mp4)", pages))
     stored = sorted(path.stem for path in FOLDER.iterdir())
     assert sorted(shown) == stored == sorted(gallery.PICTURES)
     assert sum(path.stat().st_size for path in FOLDER.iterdir()) < MOST_BYTES
@@ -77,6 +78,35 @@ def test_envelope_is_drawn_as_a_surface_with_the_captured_line(example_build, ga
     assert picture.shape[1] == 1200
     assert near(picture, (255, 255, 255)) > 0.4
     assert near(picture, (213, 94, 0), 60) > 0.002  # vermilion
+
+
+CURVES = {"keys": (0, 114, 178), "arkit": (0, 158, 115), "sparse_keys": (213, 94, 0), "poses": (86, 180, 233)}
+
+
+@pytest.mark.parametrize(("name", "colour"), CURVES.items(), ids=list(CURVES))
+def test_charts_of_a_rig_are_drawn(example_build, gallery, tmp_path, name, colour):
+    picture = pixels(gallery.PICTURES[name](example_build[0], tmp_path))
+    assert near(picture, (255, 255, 255)) > 0.4
+    assert near(picture, colour, 60) > 0.001
+
+
+def test_heads_and_models_are_drawn(example_build, gallery, tmp_path):
+    head, model = (pixels(gallery.PICTURES[name](example_build[0], tmp_path)) for name in ("head", "model"))
+    bone, gum = (200, 182, 150), (195, 120, 120)
+    assert near(head, bone, 40) > 0.02 < near(head, gum, 40)
+    assert model[..., 1].std() > 40  # from dark to bright
+
+
+@pytest.mark.slow
+def test_pictures_of_footage_report_and_phone(example_build, gallery, tmp_path):
+    outlines = pixels(gallery.footage(example_build[0], tmp_path))
+    assert near(outlines, (0, 200, 255), 60) > 0.001
+    try:
+        report, phone = (pixels(make(example_build[0], tmp_path)) for make in (gallery.report, gallery.phone))
+    except gallery.NotInstalledError as needed:
+        pytest.skip(str(needed))
+    assert report.std() > 20
+    assert near(phone, (236, 229, 212), 40) > 0.005  # enamel
 
 
 @pytest.mark.slow
