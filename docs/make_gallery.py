@@ -61,7 +61,7 @@ DRAWN_MS = 700  # until a pose is drawn without a graphics card
 PATIENCE_MS = 120_000  # for the page of the viewer, drawn without a graphics card
 
 
-FOOTAGE_FRAMES = 20, 60  # of the example capture
+FOOTAGE_FRAMES, VIEWED_FRAME = (20, 60), 168  # of the example capture
 # Function that makes a picture from the folder of a build, in a folder.
 Picture = Callable[[Path, Path], Path]
 
@@ -250,13 +250,14 @@ def footage(out: Path, folder: Path) -> Path:
 
 
 def viewer(out: Path, folder: Path) -> Path:
-    """Photograph the page of `jawusd view`, a pose with the teeth apart."""
-    with viewed(out, (1440, 900)) as (_, page):
-        for index, value in enumerate((18.0, 3.0, 1.0)):
-            box = page.locator("input.mantine-NumberInput-input:visible").nth(index)
-            box.fill(str(value))
-            box.press("Enter")
-        page.wait_for_timeout(4000)  # the last frame is drawn
+    """Photograph the page of `jawusd view` at a frame of the take, with its footage."""
+    with viewed(out, (1440, 900)) as (served, page):
+        actor = viewed_actor(out)
+        served.show(actor.load_clip(actor.take).at(VIEWED_FRAME))
+        (shown,) = served.pages.values()
+        shown.motion.show(float(VIEWED_FRAME))
+        page.wait_for_selector("img:visible")
+        page.wait_for_timeout(4000)  # jaw and footage are drawn
         picture = page.screenshot()
     return save_webp(folder / "viewer.webp", Image.open(io.BytesIO(picture)), 1200)
 

@@ -64,6 +64,7 @@ def viewed_actor(path: str | os.PathLike[str], prim: str | None = None) -> Viewe
         FormatError: the file is not a rig, or the rig has no geometry.
         RigError: the file is not USD.
     """
+    from jawusd.pipeline.view_footage import take_footage
     from jawusd.rig.geo import read_geometry
     from jawusd.rig.read import describe, load_rig
     from jawusd.viewer.viewed import ViewedActor
@@ -84,6 +85,7 @@ def viewed_actor(path: str | os.PathLike[str], prim: str | None = None) -> Viewe
         save_layer=partial(save_motion, path, rig, prim=prim),
         contacts=None if rig.contact is None else ContactView(path, rig, place).draw,
         verdict=recorded_verdict(path.parent) or "",
+        footage=take_footage(path.parent),
     )
 
 

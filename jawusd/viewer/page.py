@@ -11,6 +11,7 @@ import viser
 
 from jawusd.evaluator import JawRig
 from jawusd.geometry.se3 import transform_point
+from jawusd.viewer.footage_panel import TakeFootagePanel
 from jawusd.viewer.motion_panel import FilePanel, MotionPanel, Playback
 from jawusd.viewer.plots import VERMILION, bound_plot, posselt_plot, posselt_point
 from jawusd.viewer.pose_panel import ContactPanel, PosePanel, verdict_html
@@ -89,6 +90,7 @@ class Page:
         self.built = gui.add_html(small_text(escape(actor.verdict))) if actor.verdict else None
         self.verdict = gui.add_html("")
         self.playback = Playback(client)
+        self.footage = None if actor.footage is None else TakeFootagePanel(client, actor.footage)
         tabs = gui.add_tab_group()
         with tabs.add_tab("Pose"):
             if "mandible" in actor.placeholders:
@@ -155,9 +157,13 @@ class Page:
                 self.contacts.refresh(session.work.d)
             self.plots.refresh(session.work.d, readout.inside)
             self.motion.refresh()
+        if self.footage is not None:
+            self.footage.show(self.motion.frame)
 
     def close(self) -> None:
-        """Stop playback."""
+        """Stop playback, and drawing footage."""
         if self._opening is not None:
             self._opening.cancel()
+        if self.footage is not None:
+            self.footage.close()
         self.motion.player.close()

@@ -28,6 +28,17 @@ _STEPS, _NEAR = 8, 0.93  # maximum number of iterations, and fraction of the req
 
 
 @dataclass(frozen=True, eq=False)
+class ViewedFootage:
+    """The footage of an actor's captured take."""
+
+    cameras: tuple[str, ...]  # names of the cameras with footage or masks, in the capture's order
+    frames: tuple[int, int]  # first and last frame (inclusive) of the take
+    # maps (camera, frame of the reference camera) to an image cropped to the teeth, RGB (h, w, 3) uint8; any thread may
+    # call it; raises a JawusdError
+    picture: Callable[[str, int], NDArray[np.uint8]]
+
+
+@dataclass(frozen=True, eq=False)
 class ViewedActor:
     """An actor to view."""
 
@@ -48,6 +59,7 @@ class ViewedActor:
     # rig has no occlusion
     contacts: Callable[[Array], NDArray[np.uint8]] | None = None
     verdict: str = ""  # sentence on the build of the rig; "" if there is none
+    footage: ViewedFootage | None = None  # None if the capture is not there
 
 
 @dataclass(frozen=True, eq=False)
