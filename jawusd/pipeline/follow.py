@@ -161,7 +161,7 @@ class Follower:
         take.recover(search)
         for frame, least_mm in take.unconfirmed(begin.follow).items():
             take.known[frame] = take.known[frame].unconfirmed(least_mm, points[0])
-        return take.known
+        return dict(take.known)
 
     def _walk(self, tracker: RegionTracker, cutter: Cutter, way: range, near: RegionPose) -> Iterator[RegionPose]:
         """Yield the poses of frames in tracking order, starting next to a given pose; keep the views of some frames."""

@@ -1,6 +1,6 @@
 """Track the poses of both dental arches from masks or images of several cameras.
 
-Each subpackage imports only earlier ones in this order: `contour`; `initialization`; `sequence` and `performance`;
+Each part imports only earlier ones in this order: `follow`; `contour`; `initialization`; `sequence` and `performance`;
 `region`.
 """
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Container, Iterator, Mapping, MutableMapping
 from dataclasses import dataclass, field
 from typing import Generic, Protocol, TypeVar
 
@@ -58,6 +58,7 @@ class TwoWays(Generic[P]):
         places: returns points of the lower teeth in the frame of the upper teeth [mm], shape (N, 3).
         fit_px: returns the length of the contour that fits a pose [px].
         margin: ratio of these lengths above which another pose replaces a trusted one.
+        jump_mm: second difference of the motion of the lower teeth above which earlier frames are followed again [mm].
         progress: called with the number of frames followed and the total.
         known: poses by frame.
     """
@@ -66,8 +67,9 @@ class TwoWays(Generic[P]):
     places: Callable[[P], Array]
     fit_px: Callable[[P], float]
     margin: float = 1.0
+    jump_mm: float = _JUMP_MM
     progress: Callable[[int, int], None] = lambda done, total: None
-    known: dict[int, P] = field(default_factory=dict)
+    known: MutableMapping[int, P] = field(default_factory=dict)
 
     def follow(self, begin: Begin[P]) -> None:
         """Follow the teeth from one frame to both ends, and back from frames by which earlier ones can be judged.
@@ -113,7 +115,7 @@ class TwoWays(Generic[P]):
         meetings = [self.replace(way, begin.follow(way, begin.pose)) for way in ways]
         return False not in meetings or True in meetings
 
-    def replace(self, way: range, followed: Iterator[P]) -> bool | None:
+    def replace(self, way: range, followed: Iterator[P], doubted: Container[int] = ()) -> bool | None:
         """Replace poses by others of the same frames, as long as the two differ and the latter are better.
 
         A pose that is trusted is replaced if the other fits better, an uncertain one keeps the better fit of both.
@@ -121,16 +123,17 @@ class TwoWays(Generic[P]):
         Args:
             way: frames in tracking order.
             followed: other poses of these frames.
+            doubted: frames whose poses are not trusted.
 
         Returns:
-            True if an equal trusted pose was met, False if a different one that fits better, None if the arches were
-            lost or the take ended.
+            True if an equal trusted pose was met, False if a different one that fits better, None if an arch was lost
+            and no other one gained, or the take ended.
         """
         for frame, other in zip(way, followed, strict=False):
-            if not other.found.all():
-                return None
             old = self.known[frame]
-            if trust(old) == 2:
+            if not other.found.all() and not gained(other, old):
+                return None
+            if trust(old) == 2 and frame not in doubted:
                 if self._apart_mm(other, old) < _SAME_MM:
                     return True
                 if self.fit_px(other) <= self.margin * self.fit_px(old):
@@ -172,13 +175,14 @@ class TwoWays(Generic[P]):
             yield frame, away_mm
 
     def _turning_points(self, way: range) -> Iterator[int]:
-        """Yield the frames that are trusted more than their predecessor, or at which the jaw accelerates implausibly.
+        """Yield the frames trusted more than their predecessor, with an arch gained, or with implausible acceleration.
 
         Poses may be replaced in the meantime.
         """
         for k in range(1, len(way)):
-            jumps = k > 1 and self._bend_mm(way[k - 2 : k + 1]) > _JUMP_MM
-            if jumps or trust(self.known[way[k]]) > trust(self.known[way[k - 1]]):
+            jumps = k > 1 and self._bend_mm(way[k - 2 : k + 1]) > self.jump_mm
+            pose, last = self.known[way[k]], self.known[way[k - 1]]
+            if jumps or gained(pose, last) or trust(pose) > trust(last):
                 yield way[k]
 
     def _apart_mm(self, one: P, other: P) -> float:
@@ -194,6 +198,11 @@ class TwoWays(Generic[P]):
 def trust(pose: Located) -> int:
     """Return the trust in a pose: 0 if the teeth were not found, 1 if it is uncertain, 2 otherwise."""
     return int(pose.found.all()) * (1 if pose.uncertain else 2)
+
+
+def gained(pose: Located, other: Located) -> bool:
+    """Return whether an arch was found that was not found with another pose."""
+    return bool((pose.found & ~other.found).any())
 
 
 def lost_stretches(known: Mapping[int, P], frames: range, shortest: int = _SHORTEST_LOSS) -> list[range]:

@@ -19,10 +19,11 @@ class Pose:
     is_found: bool = True
     fit: float = 1.0
     uncertain: bool = False
+    has_upper: bool = True
 
     @property
     def found(self):
-        return np.array([True, self.is_found])
+        return np.array([self.has_upper, self.is_found])
 
 
 @dataclass
@@ -122,10 +123,33 @@ def test_uncertain_poses_keep_the_better_fit():
     assert [known.known[frame].value for frame in (20, 21, 22, 23)] == [20.0, 0.0, 22.0, 23.0]
 
 
+def test_doubted_poses_are_not_trusted():
+    """Poses equal to doubted ones do not end a replacement, nor do better doubted ones; these are kept."""
+    known = take(wrong={21: Pose(0.0, fit=2.0)})
+    followed = iter([Pose(frame + 0.1) for frame in range(20, 28)])
+    assert known.replace(range(20, 28), followed, range(20, 23)) is True
+    assert [known.known[frame].value for frame in (20, 21, 22, 23)] == [20.1, 0.0, 22.1, 23.0]
+
+
 def test_a_lost_frame_ends_a_replacement():
     known = take([20, 21, 22])
     assert replaced(known, {20: Pose(20.0), 21: Pose(21.0, False), 22: Pose(22.0)}) is None
     assert [bool(known.known[frame].found.all()) for frame in (20, 21, 22)] == [True, False, False]
+
+
+def test_one_arch_is_followed_back_while_the_other_stays_lost():
+    """Without upper teeth from 14 on, the lower ones are lost from 16 to 18: found in 19, they are followed back."""
+    alone = {frame: Pose(float(frame), frame not in (16, 17, 18), has_upper=False) for frame in range(14, 30)}
+    tracker = Tracker(alone)
+    again = {frame: Pose(float(frame), has_upper=False) for frame in range(14, 30)}
+
+    def follow(way, pose):
+        return iter([again.get(frame, Pose(float(frame))) for frame in way]) if way.step < 0 else tracker(way, pose)
+
+    known = of_frames()
+    known.follow(Begin(10, Pose(10.0), follow))
+    assert [frame for frame in FRAMES if not known.known[frame].is_found] == []
+    assert [frame for frame in FRAMES if not known.known[frame].has_upper] == list(range(14, 30))
 
 
 @pytest.mark.parametrize("step", [1, -1])
@@ -146,6 +170,13 @@ def test_a_jaw_that_jumps_is_followed_back():
     known = of_frames()
     known.follow(Begin(10, Pose(10.0), tracker))
     assert values(known) == {frame: float(frame) for frame in FRAMES}
+
+
+def test_jumps_are_plausible_if_other_evidence_judges_poses():
+    tracker = Tracker({frame: Pose(frame + 2.0, fit=0.5) for frame in range(18, 22)}, 10)
+    known = of_frames(jump_mm=np.inf)
+    known.follow(Begin(10, Pose(10.0), tracker))
+    assert [frame for frame, value in values(known).items() if value != frame] == [18, 19, 20, 21]
 
 
 def test_progress_counts_the_frames_followed():

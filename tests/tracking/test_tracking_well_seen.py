@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from small_take import FIRST, START, errors_mm, make_capture, track, write_masks
 
-from jawusd.formats.tracks import LOST, TRACKED, LostReason
+from jawusd.formats.tracks import LOST, RECOVERED, TRACKED, LostReason
 from jawusd.tracking.contour.equations import OutlineSums
 from jawusd.tracking.contour.frame_record import FrameRecord
 from jawusd.tracking.sequence import passes
@@ -24,11 +24,11 @@ def records(tmp_path_factory):
     capture = make_capture(write_masks(tmp_path_factory.mktemp("take"), FRAMES), FRAMES)
     kept = {}
 
-    def keep(self, start):
+    def keep(self, take, first):
         kept.update(self.records)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Passes, "track_back_to", keep)
+        patch.setattr(Passes, "judge_first", keep)
         track(capture)
     return kept, capture
 
@@ -49,10 +49,10 @@ def test_the_nearest_frame_that_is_tracked_is_well_seen(records):
 
 def test_wrong_first_frames_are_tracked_again_from_the_others(records, monkeypatch):
     known, capture = records
-    track_back_to = Passes.track_back_to
+    judge_first = Passes.judge_first
     seen = {}
 
-    def plant(self, start):
+    def plant(self, take, first):
         down = np.eye(4)
         down[1, 3] = -OFF_MM
         for frame in WRONG:
@@ -62,16 +62,35 @@ def test_wrong_first_frames_are_tracked_again_from_the_others(records, monkeypat
             solution = self._solver.solve(poses, views, (0.1,), record.used)
             self.records[frame] = replace(record, solution=solution)
         seen["before"] = centres(self.records)
-        track_back_to(self, start)
+        judge_first(self, take, first)
         seen["after"] = centres(self.records)
 
-    monkeypatch.setattr(Passes, "track_back_to", plant)
+    monkeypatch.setattr(Passes, "judge_first", plant)
     tracks = track(capture)
     right = centres(known)
     off_mm = {when: np.linalg.norm(found - right, axis=2).max() for when, found in seen.items()}
     assert off_mm["before"] > 2.0, "the planted frames are wrong"
     assert off_mm["after"] < 0.1
     assert (tracks.status != LOST).all()
+    assert errors_mm(tracks).max() < 0.2
+
+
+def test_lost_frames_are_followed_again_from_the_next_one(records, monkeypatch):
+    _, capture = records
+    missing, follow = {FIRST + START + 3, FIRST + START + 4}, Passes._one
+
+    def lose(self, tracker, motion, frame, views):
+        record = follow(self, tracker, motion, frame, views)
+        if frame not in missing:
+            return record
+        missing.remove(frame)
+        return lost(record)
+
+    monkeypatch.setattr(Passes, "_one", lose)
+    tracks = track(capture)
+    assert not missing
+    again = np.isin(tracks.frames - FIRST - START, (3, 4))
+    assert (tracks.status[again] == [TRACKED, RECOVERED]).all() and (tracks.status[~again] == TRACKED).all()
     assert errors_mm(tracks).max() < 0.2
 
 

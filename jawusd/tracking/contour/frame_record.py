@@ -42,10 +42,20 @@ class FrameRecord:
     coverage: Array  # uncovered fraction of every mask, shape (2, C); NaN without a mask
     losses: tuple[Loss, Loss] = (NO_LOSS, NO_LOSS)  # reasons why arches are lost
 
+    @property
+    def found(self) -> Mask:
+        """Whether each arch was found, shape (2,)."""
+        return np.asarray(self.status != LOST)
+
+    @property
+    def uncertain(self) -> bool:
+        """Whether less of the contour fits than usual: never, since arches that fit less than usual are lost."""
+        return False
+
 
 def whole_frames(records: Mapping[int, FrameRecord]) -> list[int]:
     """Return the numbers of the frames in which both arches are tracked, in ascending order."""
-    return [frame for frame in sorted(records) if (records[frame].status != LOST).all()]
+    return [frame for frame in sorted(records) if records[frame].found.all()]
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,9 +21,14 @@ from jawusd.media.working_view import WorkingView
 
 #: Minimum number of cameras if the depth of the teeth is determined only by masks.
 FEWEST_CAMERAS = 2
+#: Minimum number of masks of an arch in one frame. With one view, depth depends on the size of the outline, which a
+#: wrong mask changes.
+FEWEST_MASKS = 2
 
 _BORDER_PX = 20  # margin of a view around the masks [px]: more than the widest search
-_CHUNK = 48  # number of frames buffered when iterating backwards: about 20 MB
+# Number of frames buffered when iterating backwards, at most (about 20 MB), and at first, since frames are often
+# followed back for a few frames only.
+_CHUNK, _FIRST_CHUNK = 48, 3
 
 
 class EdgeSearch(Protocol):
@@ -163,11 +168,13 @@ class MaskViews:
             for frame in range(first, stop):
                 yield frame, self.at(frame)
             return
-        for end in range(first + 1, stop + 1, -_CHUNK):
-            begin = max(end - _CHUNK, stop + 1)
+        end, size = first + 1, _FIRST_CHUNK
+        while end > stop + 1:
+            begin = max(end - size, stop + 1)
             chunk = [(frame, self.at(frame)) for frame in range(begin, end)]
             while chunk:
                 yield chunk.pop()
+            end, size = begin, min(2 * size, _CHUNK)
 
 
 def present_masks(views: Sequence[View]) -> Mask:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, MutableMapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
@@ -108,7 +108,7 @@ class _Take:
         self._quick, self._full = (InstantSolver(one, self.coordinates) for one in (quick(solver), whole(solver)))
         self._views, self._probes = KeptViews(shot.views), solver.scans[1].probes
         self._weight = np.full(2, 1.0 / self._config.typical_noise_px3)
-        self.fits: dict[int, FrameFit] = {}
+        self.fits: MutableMapping[int, FrameFit] = {}
 
     def first_pass(self) -> None:
         """Align all frames in both directions from the start; go back over frames where that may correct them."""

@@ -19,7 +19,6 @@ from jawusd.base.arrays import Array
 from jawusd.base.errors import TrackingError
 from jawusd.formats.finding import Finding, Severity
 from jawusd.formats.notes import Registration, registration_sizes
-from jawusd.formats.tracks import LOST
 from jawusd.geometry import relative_pose, se3_adjoint, se3_exp, se3_inverse, se3_log
 from jawusd.tracking.contour.equations import translation
 from jawusd.tracking.contour.frame_record import FrameRecord, whole_frames
@@ -301,7 +300,7 @@ def observe_bite(
 
     `variance_px3` is the outline variance times correlation length per arch [px^3], shape (2,).
     """
-    used = [f for f in rest.frames if f in records and (records[f].status != LOST).all()]
+    used = [f for f in rest.frames if f in records and records[f].found.all()]
     if len(used) < _FEWEST_FRAMES:
         return
     there, back = translation(rest.point), translation(-rest.point)

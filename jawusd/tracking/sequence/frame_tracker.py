@@ -24,13 +24,9 @@ from jawusd.tracking.contour.quality import (
 )
 from jawusd.tracking.contour.scan import ARCHES
 from jawusd.tracking.contour.solver import ContourSolver
-from jawusd.tracking.contour.views import View, present_masks
+from jawusd.tracking.contour.views import FEWEST_MASKS, View, present_masks
 from jawusd.tracking.initialization.pose_search import shift_to_masks
 from jawusd.tracking.sequence.history import History
-
-# minimum number of masks of an arch: with one view, depth depends on the size of the outline, which a wrong mask
-# changes
-_FEWEST_MASKS = 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,7 +108,7 @@ class FrameTracker:
         """Align once and, if some masks are wrong, again without them."""
         use = present_masks(views)
         trial = self._try(start, views, gates, use)
-        kept = use & ~self._spoiled(trial, 2)
+        kept = use & ~self._spoiled(trial, FEWEST_MASKS)
         return trial if (kept == use).all() else self._try(start, views, gates, kept)
 
     def _record(self, first: _Trial, trial: _Trial) -> FrameRecord:
@@ -186,7 +182,7 @@ class FrameTracker:
         def first(r: int) -> Loss:
             share = float(score[r] / usual[r]) if usual[r] > 0 else np.inf
             checks = (
-                (masks[r] < _FEWEST_MASKS, LostReason.FEW_MASKS, masks[r], _FEWEST_MASKS),
+                (masks[r] < FEWEST_MASKS, LostReason.FEW_MASKS, masks[r], FEWEST_MASKS),
                 (matched[r] < c.least_matched_px, LostReason.LITTLE_CONTOUR, matched[r], c.least_matched_px),
                 (not residual[r] < allowed_px[r], LostReason.ROUGH_FIT, residual[r], allowed_px[r]),
                 (weak[r], LostReason.LOW_SCORE, share, c.suspect_score),
@@ -211,7 +207,7 @@ class FrameTracker:
             for k in np.flatnonzero(trial.use[r]):
                 rest = trial.use.copy()
                 rest[r, k] = False
-                if rest[r].sum() < 2:
+                if rest[r].sum() < FEWEST_MASKS:
                     continue
                 without = self._try(instant.starts[0], instant.views, c.gates_from(0.0), rest)
                 gain = (without.objective(c.uncovered_price) - trial.objective(c.uncovered_price))[r, rest[r]].sum()

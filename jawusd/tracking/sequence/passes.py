@@ -1,20 +1,22 @@
-"""Tracking passes over the frames of a take: away from the first frame, back to it, and backwards into every gap."""
+"""Tracking of the frames of a take from the first one, and judgement of its frames by one another."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, MutableMapping, Sequence
+from collections.abc import Callable, Container, Iterator, Mapping, MutableMapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from jawusd.base.arrays import Array
 from jawusd.formats.tracks import LOST, RECOVERED, TRACKED, LostReason
+from jawusd.geometry import relative_pose, transform_points
 from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.contour.frame_record import FrameRecord, Loss, PackedRecords
 from jawusd.tracking.contour.quality import residual_px, score_px
 from jawusd.tracking.contour.scan import ARCHES, probe_points
 from jawusd.tracking.contour.solver import ContourSolver
 from jawusd.tracking.contour.views import MaskViews, View
+from jawusd.tracking.follow import Begin, TwoWays, both_ways
 from jawusd.tracking.initialization.first_frame import first_record
 from jawusd.tracking.sequence.frame_tracker import FrameTracker
 from jawusd.tracking.sequence.history import History, MotionPredictor, SearchBudget
@@ -24,11 +26,10 @@ Progress = Callable[[int, int], None]
 # Maximum number of frames around a restart from which the tracker is initialised: without this limit, long takes with
 # many gaps would take quadratic time.
 _NEARBY_FRAMES = 4000
-_AGREED_MM = 0.05  # maximum distance between arch centres for tracking in both directions to agree [mm]
 
 
 class Passes:
-    """Runs the tracker over the frames of a take, and stores one record per frame."""
+    """Tracks the frames of a take, and stores one record per frame."""
 
     def __init__(
         self,
@@ -47,7 +48,7 @@ class Passes:
         self.searches = SearchBudget(stop - first)
 
     def track_from(self, frame: int, poses: Array) -> None:
-        """Track outwards from the given frame in both directions, then back to it, then fill the gaps.
+        """Track from the given frame in both directions, and back from frames by which others can be judged.
 
         Args:
             frame: reference frame number.
@@ -58,109 +59,79 @@ class Passes:
             TrackingError: the teeth do not fit the masks of that frame.
             CaptureError: a mask cannot be read.
         """
-        self.begin(frame, poses)
-        self.run(range(frame + 1, self._stop))
-        self.run(range(frame - 1, self._first - 1, -1))
-        self.track_back_to(frame)
-        self.close_gaps()
+        take = TwoWays(
+            range(self._first, self._stop),
+            self._places,
+            _fitting_px,
+            jump_mm=np.inf,  # masks show whether a pose is wrong
+            progress=self._progress,
+            known=self.records,
+        )
+        take.follow(Begin(frame, self.begin(frame, poses), self._walk))
+        self.judge_first(take, frame)
 
-    def begin(self, frame: int, poses: Array) -> None:
+    def begin(self, frame: int, poses: Array) -> FrameRecord:
         """Align the first frame."""
-        self.records[frame] = first_record(self._solver, self._config, poses, self._masks.at(frame), frame, True)
-        self._progress(1, self._stop - self._first)
+        return first_record(self._solver, self._config, poses, self._masks.at(frame), frame, True)
 
-    def run(self, frames: range) -> None:
-        """Track a range of frames that starts next to a tracked one."""
-        if not len(frames):
-            return
-        tracker, motion = self.beside(frames.start - frames.step)
-        for frame, views in self._masks.walk(frames.start, frames.stop, frames.step):
-            record = self._one(tracker, motion, frame, views)
-            self.records[frame] = record
-            self._progress(len(self.records), self._stop - self._first)
+    def judge_first(self, take: TwoWays[FrameRecord], first: int) -> None:
+        """Follow from the nearest frame with a good fit back to the first one, and on until an equal pose is met.
 
-    def track_back_to(self, start: int) -> None:
-        """Track from a frame with a good fit to the first frame, and past that until both tracking directions agree.
-
-        The first frame was aligned before the usual fit of the take was known, and its neighbours were tracked from it.
+        The first frame was aligned before the usual fit was known, and its neighbours were followed from it.
         """
-        seen = nearest_well_seen(self.records, start)
-        if seen is None or seen == start:
+        seen = nearest_well_seen(self.records, first)
+        if seen is None or seen == first:
             return
-        step = 1 if seen < start else -1
-        judged = self.records.kept(frame for frame in self.records if (frame - seen) * step <= 0)
-        tracker, motion = self.beside(seen, judged)
-        for frame, views in self._masks.walk(seen + step, self._stop if step > 0 else self._first - 1, step):
-            before = self.records[frame]
-            record = self._one(tracker, motion, frame, views, before.solution.poses)
-            found = (record.status != LOST).all()
-            apart = np.linalg.norm(record.solution.centres - before.solution.centres, axis=1).max()
-            if (frame - start) * step > 0 and found and apart < _AGREED_MM:
-                return
-            both = record.used & before.used
-            gain = np.where(both, score_px(record.solution) - score_px(before.solution), 0.0)
-            if not found or gain.sum() >= 0:
-                self.records[frame] = record
+        way = both_ways(seen, take.frames)[seen > first]
+        doubted = range(way.start, first + way.step, way.step)
+        take.replace(way, self._walk(way, self.records[seen], way), doubted)
 
-    def close_gaps(self) -> None:
-        """Track backwards into every gap from the frame after it, and keep results that lose fewer arches."""
-        for first, stop in _gaps(self.records):
-            if stop not in self.records:
-                continue
-            tracker, motion = self.beside(stop)
-            for frame, views in self._masks.walk(stop - 1, first - 1, -1):
-                record = self._one(tracker, motion, frame, views)
-                lost, was_lost = record.status == LOST, self.records[frame].status == LOST
-                if (lost <= was_lost).all() and (lost != was_lost).any():
-                    status = np.where(was_lost & ~lost, RECOVERED, record.status).astype(np.int8)
-                    self.records[frame] = replace(record, status=status)
-
-    def beside(
-        self, frame: int, records: Mapping[int, FrameRecord] | None = None
-    ) -> tuple[FrameTracker, MotionPredictor]:
-        """Return a tracker and a motion predictor, initialised from the frames around a tracked frame."""
-        records = records or self.records
+    def tracker_beside(self, frame: int, without: Container[int] = ()) -> FrameTracker:
+        """Return a tracker for the neighbour of a frame, initialised with the usual fit in other frames around it."""
         history = History(self._config.history_frames, self._config.score_frames)
-        known = sorted(records, key=lambda f: -abs(f - frame))[-_NEARBY_FRAMES:]
-        for near in known[-self._config.history_frames :]:
-            history.add(records[near])
-        motion = MotionPredictor(records[frame].solution.poses, self._probes)
-        for near in known[::10]:
-            motion.remember(records[near].solution.poses, records[near].status != LOST)
-        return FrameTracker(self._solver, self._config, history), motion
+        for near in self._around(frame, without)[-self._config.history_frames :]:
+            history.add(self.records[near])
+        return FrameTracker(self._solver, self._config, history)
 
-    def _one(
-        self,
-        tracker: FrameTracker,
-        motion: MotionPredictor,
-        frame: int,
-        views: Sequence[View],
-        known: Array | None = None,
-    ) -> FrameRecord:
-        """Track the next frame; if an arch is lost, also try `known` poses, shape (2, 4, 4)."""
+    def _around(self, frame: int, without: Container[int]) -> list[int]:
+        """Return the tracked frames around a frame, the nearest ones last."""
+        known = (other for other in self.records if other not in without)
+        return sorted(known, key=lambda other: -abs(other - frame))[-_NEARBY_FRAMES:]
+
+    def _walk(self, way: range, near: FrameRecord, without: Container[int] = ()) -> Iterator[FrameRecord]:
+        """Yield the records of frames in tracking order, next to a given one.
+
+        The tracker is initialised from the frames tracked before. Arches that were lost before count as recovered.
+        """
+        beside = way.start - way.step
+        tracker = self.tracker_beside(beside, without)
+        motion = MotionPredictor(near.solution.poses, self._probes)
+        for frame in self._around(beside, without)[::10]:
+            motion.remember(self.records[frame].solution.poses, self.records[frame].found)
+        for frame, views in self._masks.walk(way.start, way.stop, way.step):
+            record = self._one(tracker, motion, frame, views)
+            if frame in self.records:
+                again = record.found & ~self.records[frame].found
+                record = replace(record, status=np.where(again, RECOVERED, record.status).astype(np.int8))
+            yield record
+
+    def _one(self, tracker: FrameTracker, motion: MotionPredictor, frame: int, views: Sequence[View]) -> FrameRecord:
+        """Track the next frame."""
         reach = self._config.gate_per_miss * motion.miss_mm() * self._config.working_px_per_mm
         may_search = motion.search_is_due() and self.searches.allows(frame)
         record = tracker.track(motion.starts(), views, motion.pose_history() if may_search else None, reach)
         if tracker.searched:
-            self.searches.note(frame, bool((record.status != LOST).all()))
-        if known is not None and (record.status == LOST).any():
-            other = tracker.track([known], views, None)
-            record = other if (other.status != LOST).all() else record
-        motion.update(record.solution.poses, np.asarray(record.status != LOST), np.asarray(record.used.any(1)))
+            self.searches.note(frame, bool(record.found.all()))
+        motion.update(record.solution.poses, record.found, np.asarray(record.used.any(1)))
         tracker.history.add(record)
         return record
 
+    def _places(self, record: FrameRecord) -> Array:
+        return transform_points(relative_pose(*record.solution.poses), self._probes[1])
 
-def _gaps(records: Mapping[int, FrameRecord]) -> Iterable[tuple[int, int]]:
-    """Return the runs of frames in which an arch is lost, each as first frame and one past the last."""
-    lost = [frame for frame in sorted(records) if (records[frame].status == LOST).any()]
-    runs: list[list[int]] = []
-    for frame in lost:
-        if runs and runs[-1][1] == frame:
-            runs[-1][1] = frame + 1
-        else:
-            runs.append([frame, frame + 1])
-    return [(a, b) for a, b in runs]
+
+def _fitting_px(record: FrameRecord) -> float:
+    return float(score_px(record.solution).sum())
 
 
 # Minimum score and maximum residual of a frame with a good fit, relative to the medians of the take. These limits only
@@ -192,7 +163,7 @@ def nearest_well_seen(records: Mapping[int, FrameRecord], start: int) -> int | N
 def mark_poorly_seen_lost(records: MutableMapping[int, FrameRecord]) -> None:
     """Mark arches as lost in frames in which they match far less contour than usual, with far larger residuals."""
     frames = sorted(records)
-    kept = np.array([records[frame].status != LOST for frame in frames])
+    kept = np.array([records[frame].found for frame in frames])
     share, residual = (np.full((len(frames), 2), np.nan) for _ in range(2))
     for k, frame in enumerate(frames):
         solution = records[frame].solution

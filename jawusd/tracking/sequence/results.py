@@ -207,7 +207,7 @@ def take_correlation_px(records: Mapping[int, FrameRecord], config: TrackingConf
 
 def _of_tracked(records: Mapping[int, FrameRecord], figure: Callable[[Solution], Array]) -> Array:
     """Return a value of every frame and arch, NaN where the arch is lost, shape (F, 2)."""
-    return np.stack([np.where(r.status != LOST, figure(r.solution), np.nan) for r in records.values()])
+    return np.stack([np.where(r.found, figure(r.solution), np.nan) for r in records.values()])
 
 
 def _covariances(
@@ -221,7 +221,7 @@ def _covariances(
     for k, frame in enumerate(sorted(records)):
         record = records[frame]
         sigma = residual_px(record.solution)
-        for r in np.flatnonzero(record.status != LOST).tolist():
+        for r in np.flatnonzero(record.found).tolist():
             A = se3_adjoint(translation(record.solution.centres[r]))
             response = A @ pose_response(records, frame, r, extrinsics)
             between = A @ interpolation_covariance(records, frame, r, nuisances.delays) @ A.T

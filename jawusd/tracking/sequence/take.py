@@ -231,7 +231,7 @@ class _Take(Passes):
     def _realign(self, nuisances: Nuisances, extrinsics: Extrinsics) -> None:
         """Align every frame again from its poses, with all nuisance parameters corrected."""
         before = self.records.kept(self.records)
-        tracker, _ = self.beside(self._first)
+        tracker = self.tracker_beside(self._first)
         for frame, views in self._masks.walk(self._first, self._stop):
             views = _corrected_views(views, before, frame, nuisances, extrinsics)
             record = tracker.track(_starts_again(before, frame), views, None)
