@@ -16,7 +16,7 @@ from jawusd.tracking.contour.frame_record import FrameRecord
 from jawusd.tracking.contour.quality import arch_fit, coverage_error, score_px, uncovered_px
 from jawusd.tracking.contour.scan import ARCH_NAMES, ARCHES
 from jawusd.tracking.contour.solver import ContourSolver
-from jawusd.tracking.contour.views import View, present_masks
+from jawusd.tracking.contour.views import FEWEST_MASKS, View, present_masks
 from jawusd.tracking.initialization.magnification import magnified, measure_magnification
 
 # Minimum `arch_fit` of a first frame [-]: wrong poses stay below it; correct poses exceed it, even with most lower
@@ -29,7 +29,9 @@ _CLEAR_FIT = 0.3
 # for it to be corrected [-]; and number of iterations, since contours far from their masks are not matched at first.
 _LEAST_SCALE, _OWN_SCALE, _SIZE_ROUNDS = 0.02, 0.015, 3
 _SIZE_HINT = "Check the scans' scale, the board's square size, and that each calibration is for the lens and zoom used."
-_FEWEST_MASKS = 2  # minimum number of masks of an arch: one view does not determine the depth
+#: Number of refinements of a first pose from picks or a search, whose error may be a few tenths of a millimetre: each
+#: one removes most of the remaining error.
+FIRST_ROUNDS = 3
 
 
 def first_record(
@@ -49,7 +51,7 @@ def first_record(
     """
     use = present_masks(views)
     for r in ARCHES:
-        if use[r].sum() < _FEWEST_MASKS:
+        if use[r].sum() < FEWEST_MASKS:
             raise TrackingError(
                 f"the first frame has {use[r].sum()} masks of the {ARCH_NAMES[r]} teeth; at least two are needed",
                 frame=frame,
@@ -145,7 +147,7 @@ def _without_camera(use: Mask, camera: int) -> Mask:
     """Exclude the masks of a camera for each arch that has enough masks without it; return the masks kept (2, C)."""
     kept = use.copy()
     kept[:, camera] = False
-    return np.where(kept.sum(1, keepdims=True) >= _FEWEST_MASKS, kept, use)
+    return np.where(kept.sum(1, keepdims=True) >= FEWEST_MASKS, kept, use)
 
 
 def _without_spoiled(use: Mask, coverage: Array, limit: float) -> Mask:
@@ -155,4 +157,4 @@ def _without_spoiled(use: Mask, coverage: Array, limit: float) -> Mask:
     in every frame.
     """
     kept = use & ~(coverage > limit)
-    return np.where(kept.sum(1, keepdims=True) >= _FEWEST_MASKS, kept, use)
+    return np.where(kept.sum(1, keepdims=True) >= FEWEST_MASKS, kept, use)

@@ -13,7 +13,7 @@ from jawusd.tracking.contour.equations import Solution
 from jawusd.tracking.contour.quality import matched_px, residual_px, score_px
 from jawusd.tracking.contour.rendering import Rendering
 from jawusd.tracking.contour.scan import ARCHES, CROWN
-from jawusd.tracking.contour.views import View, present_masks
+from jawusd.tracking.contour.views import FEWEST_MASKS, View, present_masks
 from jawusd.tracking.performance.coordinates import Pose
 from jawusd.tracking.performance.instant import Expected, InstantSolver
 from jawusd.tracking.performance.views import Growth
@@ -24,7 +24,6 @@ LARGEST_SIGMA = np.r_[[0.3] * 3, [30.0] * 3, [10.0] * 3]
 # Matched contour below which an arch is rejected [px]: 2 mm of tooth edge. Tracking without a rig requires a longer
 # contour.
 _LEAST_MATCHED_PX = 15.0
-_FEWEST_MASKS = 2  # Minimum number of masks that an arch must fit if another mask is left out.
 _TYPICAL_PX = 0.4  # Typical residual of hand-drawn masks at the working resolution [px].
 
 
@@ -145,7 +144,7 @@ class Attempts:
     def without_wrong_masks(self, trial: Trial, expected: Expected, instant: Instant) -> Trial:
         """Leave out a single mask of each arch that does not fit, if the arch then fits at least two other masks."""
         for r in ARCHES:
-            if not self.bad(trial)[r] or trial.use[r].sum() <= _FEWEST_MASKS:
+            if not self.bad(trial)[r] or trial.use[r].sum() <= FEWEST_MASKS:
                 continue  # if fewer masks would remain, a wrong pose is more likely than a wrong mask
             masks = np.flatnonzero(trial.use[r])  # the mask that the scan covers least is tried first
             for c in masks[np.argsort(-trial.uncovered_px[r, masks])]:

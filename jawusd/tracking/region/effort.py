@@ -44,12 +44,15 @@ class Effort:
     learn_every: int
 
 
+#: Residual gates of an alignment that starts from the prediction, and of one that starts from a more distant pose [px].
+NEAR_GATES_PX, FAR_GATES_PX = (6.0, 4.0, 3.0, 2.5, 2.0), (12.0, 8.0, 6.0, 4.0, 3.0, 2.5, 2.0)
+
 #: Effort for recorded images.
 THOROUGH = Effort(
-    gates_px=(6.0, 4.0, 3.0, 2.5, 2.0),
-    next_px=(6.0, 4.0, 3.0, 2.5, 2.0),
-    far_px=(6.0, 4.0, 3.0, 2.5, 2.0),
-    wide_px=(12.0, 8.0, 6.0, 4.0, 3.0, 2.5, 2.0),
+    gates_px=NEAR_GATES_PX,
+    next_px=NEAR_GATES_PX,
+    far_px=NEAR_GATES_PX,
+    wide_px=FAR_GATES_PX,
     uncertain=0.8,
     searched=0.6,
     jaws=16,

@@ -27,7 +27,7 @@ from jawusd.tracking.performance.skin import SkinOf, jaw_of_skin
 from jawusd.tracking.performance.smoother import WIDER, Smoothed, Smoother, with_one_head
 from jawusd.tracking.region.appearance import Cut, LearnedColours
 from jawusd.tracking.region.rig_tracker import RigTracker
-from jawusd.tracking.region.search import fitting_share
+from jawusd.tracking.region.search import FACES, REDRAW_PX, SAMPLE_STEP_PX, fitting_share
 
 #: Function that returns the cropped images of a range of frames. Arguments: cameras, possibly with changed focal
 #: lengths; a world point near the teeth, which determines the resolution [mm], shape (3,); and the frames.
@@ -37,9 +37,8 @@ Cuts = Callable[[Sequence[Camera], Array, range], Iterator[Cut]]
 Find = Callable[[range, Array], tuple[int, Pose]]
 Progress = Callable[[int, int], None]
 
-# Number of crown faces before the last step, and in it; spacing of contour samples [px]; image motion after which scans
-# are rendered again [px]; pose update below which intermediate gates are skipped [mm].
-_ROUGH_FACES, _FACES, _SAMPLE_STEP_PX, _REDRAW_PX, _SETTLED_MM = 6_000, 20_000, 2.0, 2.0, 0.08
+# Number of crown faces in the last step; pose update below which intermediate gates are skipped [mm].
+_LAST_FACES, _SETTLED_MM = 20_000, 0.08
 # Number of frames from which a fixed head pose and unknown focal lengths are estimated in advance, and number of rounds
 # for focal lengths.
 _FIRST_FRAMES, _FOCAL_ROUNDS = 120, 3
@@ -99,17 +98,17 @@ class PictureTake:
             config: settings of the tracker.
         """
         self._axes, self._jaw, self._shot = axes, jaw, shot
-        self._scans = [thinned(scan, _FACES) for scan in scans]
+        self._scans = [thinned(scan, _LAST_FACES) for scan in scans]
         self.coordinates = Coordinates(jaw, self._scans)
         config = replace(
             config or TrackingConfig(),
-            sample_step_px=_SAMPLE_STEP_PX,
-            redraw_px=_REDRAW_PX,
+            sample_step_px=SAMPLE_STEP_PX,
+            redraw_px=REDRAW_PX,
             settled_mm=_SETTLED_MM,
         )
         self._instants, self._rough = (
             InstantSolver(ContourSolver([thinned(scan, faces) for scan in scans], config), self.coordinates)
-            for faces in (_FACES, _ROUGH_FACES)
+            for faces in (_LAST_FACES, FACES)
         )
 
     def begun(self, frame: int, near: Pose) -> tuple[Pose, float]:

@@ -14,32 +14,32 @@ from jawusd.tracking.contour.quality import matched_px, score_px
 from jawusd.tracking.contour.scan import CROWN
 from jawusd.tracking.contour.solver import Matched
 from jawusd.tracking.contour.views import present_masks
+from jawusd.tracking.initialization.first_frame import FIRST_ROUNDS
 from jawusd.tracking.performance.attempts import LARGEST_SIGMA, FrameFit
 from jawusd.tracking.performance.coordinates import JAW, Pose
 from jawusd.tracking.performance.instant import Aligned, Expected, InstantSolver
 from jawusd.tracking.performance.motion import Prediction
 from jawusd.tracking.performance.single_start import spread_out
 from jawusd.tracking.performance.views import growth_of
-from jawusd.tracking.region.appearance import CORRELATION_PX, FIRST_RATES, RATES, Cut, LearnedColours, Picture
-from jawusd.tracking.region.effort import THOROUGH, Effort
-from jawusd.tracking.region.search import fitting_share, head_shifts, rank_by_colour
+from jawusd.tracking.region.appearance import FIRST_RATES, RATES, Cut, LearnedColours, Picture
+from jawusd.tracking.region.effort import FAR_GATES_PX, THOROUGH, Effort
+from jawusd.tracking.region.search import (
+    AGAIN,
+    BORDER_PX3,
+    LAST_GATES_PX,
+    LEAST_USUAL,
+    TRIAL_GATES_PX,
+    USUAL_FRAMES,
+    fitting_share,
+    head_shifts,
+    rank_by_colour,
+)
 
-# Variance of colour borders times their correlation length [px^3].
-_BORDER_PX3 = 0.7**2 * CORRELATION_PX
-_FIRST_GATES_PX = (12.0, 8.0, 6.0, 4.0, 3.0, 2.5, 2.0)
-_LAST_GATES_PX = (2.0,)
-_TRIAL_GATES_PX = (8.0, 6.0)  # residual gates of the short trial alignments of a search [px]
 # Longest intervals between steps [frames] that count as no dropped frame, and as one dropped frame.
 _NEXT_FRAMES, _STEADY_FRAMES = 1.5, 2.5
-_FIRST_ROUNDS = 3  # number of refinements of the start, whose error may be a few tenths of a millimetre
-# Fractions of the usual matched contour length below which an arch becomes lost, and below which a lost arch stays
-# lost.
-_LOST, _AGAIN = 0.33, 0.5
+_LOST = 0.33  # fraction of the usual matched contour length below which an arch becomes lost
 # number of frames since the last step above which an arch must fit as well as after a loss
 _UNSURE_FRAMES = 3.0
-_USUAL_FRAMES = 15  # number of recent frames that define the usual matched fraction
-# lower bound of the usual matched fraction, relative to the first frame
-_LEAST_USUAL = 0.7
 _JAWS = 96  # number of jaw poses that a search ranks by colour
 
 
@@ -74,7 +74,7 @@ class RigTracker:
         self._jaws = spread_out(instants.coordinates.jaw, _JAWS)
         places = instants.coordinates.jaw.pose(self._jaws)
         self._widest = places[np.argmax(np.linalg.norm(places[:, :3, 3], axis=1))]
-        self._usual: deque[Array] = deque(maxlen=_USUAL_FRAMES)
+        self._usual: deque[Array] = deque(maxlen=USUAL_FRAMES)
         self._least_px = instants.config.least_matched_px
         self._failed = self._frame = 0
 
@@ -83,10 +83,10 @@ class RigTracker:
         arches = self._coordinates.arches(pose)
         self._colours.begin(cut(arches), arches)
         sigma = LARGEST_SIGMA * np.r_[[min(1.0, self._head)] * 6, [1.0] * 3]
-        for _ in range(_FIRST_ROUNDS):
+        for _ in range(FIRST_ROUNDS):
             arches = self._coordinates.arches(pose)
             look = _InstantImages(self._instants, self._colours, cut(arches), arches, self._whole)
-            rough = look.align(pose, Expected(pose, sigma**-2.0), _FIRST_GATES_PX)
+            rough = look.align(pose, Expected(pose, sigma**-2.0), FAR_GATES_PX)
             found = look.polished(rough, Expected(pose, sigma**-2.0))
             pose = found.pose
             look.learn(pose, FIRST_RATES)
@@ -113,7 +113,7 @@ class RigTracker:
             return FrameFit(expected.pose, None, look.use, look.use, np.full(look.use.shape, np.nan))
         unsure = (self._motion.blind > 0) | (frames > _UNSURE_FRAMES)
         usual = self._usual_share()
-        least = np.where(unsure, _AGAIN, _LOST) * usual
+        least = np.where(unsure, AGAIN, _LOST) * usual
         rough, look = self._best(expected, look, cut, frames, least)
         share, found = fitting_share(rough.solution), look.polished(rough, expected)
         trusted = (share >= least) & (matched_px(found.solution) >= self._least_px)
@@ -135,7 +135,7 @@ class RigTracker:
         self._usual.append(np.where(share >= THOROUGH.searched * usual, share, usual))
 
     def _usual_share(self) -> Array:
-        return np.maximum(np.median(self._usual, axis=0), _LEAST_USUAL * self._first)
+        return np.maximum(np.median(self._usual, axis=0), LEAST_USUAL * self._first)
 
     def _look(self, cut: Cut, around: Array) -> _InstantImages:
         """Return the images cropped around both arches at poses (2, 4, 4)."""
@@ -198,7 +198,7 @@ class RigTracker:
         for head in (shifts[k] @ expected.pose.head for k in order):
             start = replace(expected.pose, head=head)
             around = Expected(start, LARGEST_SIGMA**-2.0)
-            found = _better(found, look.align(start, around, _TRIAL_GATES_PX))
+            found = _better(found, look.align(start, around, TRIAL_GATES_PX))
         gates = self._effort.wide_px or self._effort.gates_px
         return look.align(found.pose, Expected(found.pose, LARGEST_SIGMA**-2.0), gates)
 
@@ -211,7 +211,7 @@ class RigTracker:
         loose[JAW] = LARGEST_SIGMA[JAW] ** -2.0
         for k in order[: self._effort.jaws]:
             start = replace(found.pose, d=self._jaws[k])
-            brief.append(look.align(start, Expected(start, loose), _TRIAL_GATES_PX))
+            brief.append(look.align(start, Expected(start, loose), TRIAL_GATES_PX))
         brief.sort(key=lambda trial: -float(score_px(trial.solution).sum()))
         for trial in brief[: self._effort.finalists]:
             around = Expected(trial.pose, loose)
@@ -237,16 +237,16 @@ class _InstantImages:
 
     def align(self, start: Pose, expected: Expected, gates_px: Sequence[float]) -> Aligned:
         """Return the most likely pose near a start."""
-        weight = np.full(2, 1.0 / _BORDER_PX3)
+        weight = np.full(2, 1.0 / BORDER_PX3)
         return self._instants.align(start, self.views, self.use, gates_px, expected, weight, self._rendering)
 
     def polished(self, found: Aligned, expected: Expected) -> Aligned:
         """Refine an alignment with all faces; visibility is not recomputed."""
         if self._whole is None:
             return found
-        weight = np.full(2, 1.0 / _BORDER_PX3)
+        weight = np.full(2, 1.0 / BORDER_PX3)
         self._counting = views = self._colours.counting(self.views)
-        return self._whole.align(found.pose, views, self.use, _LAST_GATES_PX, expected, weight, self._rendering)
+        return self._whole.align(found.pose, views, self.use, LAST_GATES_PX, expected, weight, self._rendering)
 
     def upper_crowns(self, pose: Pose) -> list[Mask]:
         """Return masks of the pixels that upper crowns cover at a pose, one per view."""

@@ -19,6 +19,7 @@ from jawusd.tracking.contour.scan import Scan, thinned
 from jawusd.tracking.contour.solver import ContourSolver
 from jawusd.tracking.contour.views import View, present_masks
 from jawusd.tracking.region.appearance import CORRELATION_PX
+from jawusd.tracking.region.effort import FAR_GATES_PX, NEAR_GATES_PX
 from jawusd.tracking.region.jaw_priors import BiteTerm, CondyleMotion, CondyleTerm
 from jawusd.tracking.region.view import RegionView
 from jawusd.tracking.sequence.history import MotionPredictor
@@ -48,16 +49,18 @@ _SHIFTS_MM = [
     *((0.0, far, 0.0) for far in _FAR_MM),
 ]
 
-# Residual gates of an alignment that starts from the prediction, and of one that starts from a more distant pose [px].
-_NEAR_GATES_PX, _FAR_GATES_PX = (6.0, 4.0, 3.0, 2.5, 2.0), (12.0, 8.0, 6.0, 4.0, 3.0, 2.5, 2.0)
 # Residual gates of the short trial alignments of a search [px]. Residual gate of the final step, which uses all faces
 # of the scans [px]. Spacing of contour samples [px]. Image motion after which the scans are rendered again [px].
-_TRIAL_GATES_PX, _LAST_GATES_PX, _SAMPLE_STEP_PX, _REDRAW_PX = (8.0, 6.0), (2.0,), 2.0, 2.0
-_FACES = 6_000  # number of crown faces of the scans before the final step
+TRIAL_GATES_PX, LAST_GATES_PX, SAMPLE_STEP_PX, REDRAW_PX = (8.0, 6.0), (2.0,), 2.0, 2.0
+FACES = 6_000  # number of crown faces of the scans before the final step
+# The usual matched contour is the median over the last `USUAL_FRAMES` frames, but at least `LEAST_USUAL` times that of
+# the first frame, so that slowly closing lips do not redefine it. Below a fraction `AGAIN` of it, a lost arch stays
+# lost.
+USUAL_FRAMES, LEAST_USUAL, AGAIN = 15, 0.7, 0.5
 # Border variance times correlation length that sets the weight of the condylar prior [px^3]: for a clearly visible jaw,
 # and in uncertain frames, where a lower weight would let a hidden jaw drift.
 _LOOSE_PX3, _FIRM_PX3 = 3.0, 15.0
-_BORDER_PX3 = 0.7**2 * CORRELATION_PX  # border variance times correlation length, as estimated from residuals
+BORDER_PX3 = 0.7**2 * CORRELATION_PX  # border variance times correlation length, as estimated from residuals
 # Penalty per unit of the condyles' squared Mahalanobis distance, as length of matched contour [px]: Tukey's loss of a
 # sample beyond the gate is 4.685^2 / 6, and neighbouring samples are correlated over `CORRELATION_PX`.
 _STRAIN_PX = 0.5 * CORRELATION_PX * 6.0 / 4.685**2
@@ -132,14 +135,14 @@ class PoseSearch:
         """Prepare the scans; for the arguments, see `RegionTracker`."""
         self.config = replace(
             config or TrackingConfig(),
-            sample_step_px=_SAMPLE_STEP_PX,
-            redraw_px=_REDRAW_PX,
+            sample_step_px=SAMPLE_STEP_PX,
+            redraw_px=REDRAW_PX,
         )
         self.solver = ContourSolver([replace(scan, thin=None) for scan in scans], self.config, executor)
-        self._thin = ContourSolver([thinned(scan, _FACES) for scan in scans], self.config, executor)
+        self._thin = ContourSolver([thinned(scan, FACES) for scan in scans], self.config, executor)
         self.condyles = CondyleMotion(landmarks, axes)
         self._loose, self._firm = (CondyleTerm(self.condyles, noise) for noise in (_LOOSE_PX3, _FIRM_PX3))
-        self._bite, self._axes = BiteTerm(landmarks[:3], axes[1], _BORDER_PX3), axes
+        self._bite, self._axes = BiteTerm(landmarks[:3], axes[1], BORDER_PX3), axes
 
     def near(self, start: Array, look: InstantViews, *, firm: bool = False) -> Solution:
         """Align from a start accurate to a few tenths of a millimetre, T_world_upper and T_world_lower (2, 4, 4).
@@ -147,7 +150,7 @@ class PoseSearch:
         Args:
             firm: whether the condylar prior has a high weight, for uncertain frames.
         """
-        return self._align(start, look, _FAR_GATES_PX, firm)
+        return self._align(start, look, FAR_GATES_PX, firm)
 
     def best(self, starts: list[Array], look: InstantViews, last: Array) -> Solution:
         """Align from the prediction and, if the motion is fast, from other starts.
@@ -156,17 +159,17 @@ class PoseSearch:
             starts: poses, the prediction first.
             last: poses of the previous frame.
         """
-        solution = self._align(starts[0], look, _NEAR_GATES_PX)
+        solution = self._align(starts[0], look, NEAR_GATES_PX)
         if np.abs(starts[0][:, :3, 3] - last[:, :3, 3]).max() > _FAST_MM:
             carried = solution.poses[0] @ se3_inverse(last[0]) @ last[1]
             for start in (last, np.stack([solution.poses[0], carried])):
-                solution = self._better(solution, self._align(start, look, _FAR_GATES_PX))
+                solution = self._better(solution, self._align(start, look, FAR_GATES_PX))
         return solution
 
     def from_farther(self, solution: Solution, start: Array, last: Array, look: InstantViews) -> Solution:
         """Align from a start pose, using wide residual gates, and from the last poses; return the better solution."""
-        solution = self._better(solution, self._align(start, look, _FAR_GATES_PX))
-        return self._better(solution, self._align(last, look, _NEAR_GATES_PX))
+        solution = self._better(solution, self._align(start, look, FAR_GATES_PX))
+        return self._better(solution, self._align(last, look, NEAR_GATES_PX))
 
     def with_jaw_searched(
         self,
@@ -185,7 +188,7 @@ class PoseSearch:
         for jaws, count in ((near, _HOPEFUL_NEAR if everywhere else _HOPEFUL), (anywhere, _HOPEFUL)):
             order = rank_by_colour([head @ jaw for jaw in jaws], look.views, self._thin.scans, 1)[:count]
             pairs += [np.stack([head, head @ jaws[k]]) for k in order]
-        brief = [self._align(pair, look, _TRIAL_GATES_PX, True) for pair in pairs]
+        brief = [self._align(pair, look, TRIAL_GATES_PX, True) for pair in pairs]
         brief.sort(key=lambda trial: -self.objective_px(trial))
         for trial in brief[:_FINALISTS]:
             solution = self._better(solution, self.near(trial.poses, look, firm=True))
@@ -193,16 +196,16 @@ class PoseSearch:
 
     def with_head_alone(self, solution: Solution, start: Array, look: InstantViews) -> Solution:
         """Align the head alone if that improves its fit; a wrong jaw pose biases the head in a joint fit."""
-        alone = self._align(start, look, _FAR_GATES_PX, use=_upper_alone(look.views))
+        alone = self._align(start, look, FAR_GATES_PX, use=_upper_alone(look.views))
         return max((solution, alone), key=lambda trial: float(fitting_share(trial)[0]))
 
     def with_head_searched(self, solution: Solution, predicted: Array, look: InstantViews, alone: bool) -> Solution:
         """Try shifted head poses with an unchanged jaw pose; with `alone`, the contour of the jaw is ignored."""
         shifts, use = head_shifts(predicted[0], self._axes), _upper_alone(look.views) if alone else None
         order = rank_by_colour(list(shifts @ predicted[0]), look.views, self._thin.scans, 0)[: _HOPEFUL // 2]
-        brief = [self._align(shifts[k] @ predicted, look, _TRIAL_GATES_PX, True, use) for k in order]
+        brief = [self._align(shifts[k] @ predicted, look, TRIAL_GATES_PX, True, use) for k in order]
         brief.sort(key=lambda trial: -float(score_px(trial)[0].sum()))
-        best = [self._align(trial.poses, look, _FAR_GATES_PX, True, use) for trial in brief[:_FINALISTS]]
+        best = [self._align(trial.poses, look, FAR_GATES_PX, True, use) for trial in brief[:_FINALISTS]]
         if alone:
             return max((solution, *best), key=lambda trial: float(score_px(trial)[0].sum()))
         return max((solution, *best), key=self.objective_px)
@@ -214,7 +217,7 @@ class PoseSearch:
     def polished(self, solution: Solution, views: Sequence[View], look: InstantViews, *, firm: bool) -> Solution:
         """Refine an alignment with all faces of the scans; visibility is not recomputed."""
         terms = (self._firm if firm else self._loose, self._bite)
-        return self.solver.solve(solution.poses, views, _LAST_GATES_PX, None, terms, rendering=look.rendering)
+        return self.solver.solve(solution.poses, views, LAST_GATES_PX, None, terms, rendering=look.rendering)
 
     def objective_px(self, solution: Solution) -> float:
         """Return the objective: matched contour minus a penalty for implausible condyles [px]."""

@@ -22,18 +22,15 @@ from jawusd.tracking.contour.quality import (
 )
 from jawusd.tracking.contour.scan import ARCHES, Scan, probe_points
 from jawusd.tracking.contour.views import View
+from jawusd.tracking.initialization.first_frame import FIRST_ROUNDS
 from jawusd.tracking.region.appearance import CORRELATION_PX, FIRST_RATES, RATES, Cut, LearnedColours, Picture
 from jawusd.tracking.region.effort import THOROUGH
-from jawusd.tracking.region.search import InstantViews, PoseSearch, fitting_share
+from jawusd.tracking.region.search import AGAIN, LEAST_USUAL, USUAL_FRAMES, InstantViews, PoseSearch, fitting_share
 from jawusd.tracking.sequence.history import MotionPredictor
 
-_FIRST_ROUNDS = 3  # number of refinements of the start, whose error may be a few tenths of a millimetre
 # Fractions of the usual matched contour length below which, in this order, wider residual gates are tried, the jaw is
-# searched for, a lost arch stays lost, and an arch becomes lost. The usual matched contour is the median over recent
-# frames, but at least `_LEAST_USUAL` times its value in the first frame, so that slowly closing lips do not redefine
-# it.
-_UNCERTAIN, _SUSPECT, _AGAIN, _LOST, _LEAST_USUAL = THOROUGH.uncertain, THOROUGH.searched, 0.5, 0.25, 0.7
-_USUAL_FRAMES = 15  # number of recent frames that define the usual matched fraction
+# searched for, and an arch becomes lost.
+_UNCERTAIN, _SUSPECT, _LOST = THOROUGH.uncertain, THOROUGH.searched, 0.25
 _EAGER, _OFTEN = 6, 4  # a lost arch is searched for in each of the first frames, then in every n-th one; see `_is_due`
 # number of frames in which wide residual gates are not tried again after a failure: lips stay closed for a while
 _RESTING = 4
@@ -93,7 +90,7 @@ class RegionTracker:
     def begin(self, cut: Cut, poses: Array) -> RegionPose:
         """Learn the colours of a first frame at poses accurate to a few tenths of a millimetre, and refine them."""
         self._colours.begin(cut(poses), poses)
-        for _ in range(_FIRST_ROUNDS):
+        for _ in range(FIRST_ROUNDS):
             pictures = cut(poses)
             instant = _Instant(self._search, self._colours, pictures, poses)
             rough = self._search.near(poses, instant.look)
@@ -156,7 +153,7 @@ class _DirectionTracker:
         self._search, self._colours, self._first_share, self._poses = search, colours, first_share, poses
         self._motion = MotionPredictor(poses, probe_points(search.solver.scans))
         self._motion.remember(poses, np.ones(2, bool))
-        self._usual: deque[Array] = deque(maxlen=_USUAL_FRAMES)
+        self._usual: deque[Array] = deque(maxlen=USUAL_FRAMES)
         self._found, self._missed, self._absent, self._rest = np.ones(2, bool), 0, 0, 0
 
     def follow(self, cuts: Iterator[Cut]) -> Iterator[RegionPose]:
@@ -167,7 +164,7 @@ class _DirectionTracker:
             pictures = cut(starts[0] if self._found[1] else np.stack([head, head @ wide]))
             instant = _Instant(self._search, self._colours, pictures, self._poses)
             usual = np.median([*self._usual] or [self._first_share], axis=0)
-            usual = np.maximum(usual, _LEAST_USUAL * self._first_share)
+            usual = np.maximum(usual, LEAST_USUAL * self._first_share)
             rough, searched = self._located(starts, instant.look, usual)
             yield self._taken(instant, rough, searched, usual, any(picture is not None for picture in pictures))
 
@@ -197,7 +194,7 @@ class _DirectionTracker:
 
     def _least(self) -> Array:
         """Return the fraction of the usual matched contour below which each arch counts as not found, shape (2,)."""
-        return np.where(self._found, _LOST, _AGAIN)
+        return np.where(self._found, _LOST, AGAIN)
 
     def _taken(self, instant: _Instant, rough: Solution, searched: bool, usual: Array, seen: bool) -> RegionPose:
         """Refine a rough alignment, decide which arches are found, and learn if both are."""

@@ -22,7 +22,7 @@ from jawusd.tracking.contour.scan import Scan, prepare_scan
 from jawusd.tracking.contour.solver import ContourSolver
 from jawusd.tracking.contour.views import View, present_masks
 from jawusd.tracking.initialization.bootstrap import pose_from_picks
-from jawusd.tracking.initialization.first_frame import first_record
+from jawusd.tracking.initialization.first_frame import FIRST_ROUNDS, first_record
 from jawusd.tracking.sequence.frame_tracker import FrameTracker
 from jawusd.tracking.sequence.history import History
 
@@ -30,9 +30,6 @@ from jawusd.tracking.sequence.history import History
 #: T_world_upper and T_world_lower, shape (2, 4, 4), and the index of the round, which is 0 for poses not yet aligned
 #: with masks.
 MakeViews = Callable[[int, Array, int], Sequence[View]]
-
-# number of rounds: picks are a few tenths of a millimetre off, and each round removes most of the remaining error
-_FIRST_ROUNDS = 3
 
 
 class GuidedTracker:
@@ -92,7 +89,7 @@ class GuidedTracker:
         Raises:
             TrackingError: the teeth do not fit the views.
         """
-        for turn in range(_FIRST_ROUNDS):
+        for turn in range(FIRST_ROUNDS):
             views = self._see(frame, poses, min(turn, self._rounds - 1))
             record = first_record(self._solver, self._config, poses, views, frame)
             poses = record.solution.poses
