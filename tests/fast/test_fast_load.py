@@ -11,7 +11,6 @@ from example_model import example_arrays, example_meta
 
 import jawusd
 from jawusd.evaluator.kernels import NumpyKernels
-from jawusd.fast.kernels import CompiledKernels
 
 # refuses numba as an interpreter without it does
 WITHOUT_NUMBA = """
@@ -42,6 +41,8 @@ def run(code, *arguments):
 
 
 def test_fast_gives_a_compiled_rig_and_plain_does_not(model):
+    from jawusd.fast.kernels import CompiledKernels  # compiles, which not every process that collects tests need do
+
     fast, plain = jawusd.load(model, fast=True), jawusd.load(model)
     assert type(fast.kernels) is CompiledKernels and type(plain.kernels) is NumpyKernels
     np.testing.assert_allclose(fast.pose([20.0, 1.0, 1.0]), plain.pose([20.0, 1.0, 1.0]), atol=1e-10)

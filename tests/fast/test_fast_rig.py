@@ -14,12 +14,9 @@ from example_model import example_arrays, example_meta, touching_arrays
 from scipy.optimize import least_squares
 
 from jawusd.evaluator import JawRig, Reason
-from jawusd.fast import accelerate, kernels
-from jawusd.fast.kernels import CompiledKernels
 from jawusd.geometry.se3 import se3_exp, transform_points
 
 RIGS = {kind: JawRig(example_arrays(kind), example_meta(kind)) for kind in ("anchored", "additive")}
-FAST = {kind: accelerate(rig) for kind, rig in RIGS.items()}
 SHAPES = [(), (1,), (3, 1, 2), (0,), (2, 0)]
 FROM_D = ("pose", "twist", "jacobian", "margin", "margin_gradient", "normalized", "captured_distance")
 ABSURD = [np.nan, np.inf, -np.inf, 1e9, 1e300]
@@ -37,9 +34,22 @@ def rig(kind):
     return RIGS[kind]
 
 
+@pytest.fixture(scope="module")
+def accelerate():
+    """Return the function; its import compiles, which only the process that runs these tests need do."""
+    from jawusd.fast import accelerate
+
+    return accelerate
+
+
+@pytest.fixture(scope="module")
+def compiled(accelerate):
+    return {kind: accelerate(rig) for kind, rig in RIGS.items()}
+
+
 @pytest.fixture
-def fast(kind):
-    return FAST[kind]
+def fast(kind, compiled):
+    return compiled[kind]
 
 
 def random_d(rig, shape, beyond_mm=6.0, seed=0):
@@ -254,11 +264,15 @@ def test_results_do_not_share_memory(fast):
 
 def test_compiled_functions_refuse_other_types(fast):
     """Or they would be compiled anew, for seconds, inside somebody's playback."""
+    from jawusd.fast import kernels
+
     with pytest.raises(TypeError):
         kernels.poses(fast.kernels._packed_model, np.zeros((2, 3), dtype=np.float32), np.empty((2, 4, 4)))
 
 
-def test_rig_pickles_and_evaluates_in_threads(kind, fast):
+def test_rig_pickles_and_evaluates_in_threads(accelerate, fast):
+    from jawusd.fast.kernels import CompiledKernels
+
     d, T = random_d(fast, (32, 50)), noisy_poses(fast, (32, 50))
     copy = pickle.loads(pickle.dumps(fast))
     assert type(copy.kernels) is CompiledKernels
@@ -269,7 +283,8 @@ def test_rig_pickles_and_evaluates_in_threads(kind, fast):
     assert accelerate(fast) is fast
 
 
-def test_rig_works_in_a_forked_process():
+def test_rig_works_in_a_forked_process(compiled, tmp_path):
+    """Started elsewhere, so that it imports what these tests have compiled, not other sources in the current folder."""
     code = (
         "import multiprocessing, sys\n"
         "import numpy as np\n"
@@ -282,7 +297,7 @@ def test_rig_works_in_a_forked_process():
         "    assert (pool.map(rig.pose, d) == rig.pose(d)).all()\n"
         "print('same')\n"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=SUPPORT)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=SUPPORT, cwd=tmp_path)
     assert done.stdout.strip() == "same", done.stderr
 
 
@@ -296,7 +311,7 @@ def test_inverse_kinematics_takes_any_batch_shape(rig, fast, shape, started):
     np.testing.assert_allclose(left_mm, expected_mm, rtol=0, atol=1e-5)
 
 
-def test_a_rig_whose_teeth_meet_gives_what_the_evaluator_gives():
+def test_a_rig_whose_teeth_meet_gives_what_the_evaluator_gives(accelerate):
     rig = JawRig({**example_arrays(), **touching_arrays()}, example_meta())
     fast, d = accelerate(rig), random_d(rig, (200,))
     for name in FROM_D:
