@@ -1,14 +1,13 @@
 """The first frames of the example capture as a shot, solved with the rig built from the whole capture."""
 
 import json
-import subprocess
-import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from package_copy import ROOT
 from pxr import Sdf
+from run_jawusd import run
 from short_example import write_short
 
 import jawusd
@@ -49,13 +48,6 @@ def tip_errors_mm(rig, frames, d):
         relative = truth["T_upper_lower"][np.searchsorted(truth["frames"], frames)]
     tip = rig.landmarks[0]
     return np.linalg.norm(transform_point(rig.pose(d), tip) - transform_point(relative, tip), axis=-1)
-
-
-def run(*arguments, code=0):
-    command = [sys.executable, "-m", "jawusd", *map(str, arguments)]
-    result = subprocess.run(command, capture_output=True, text=True, timeout=600, check=False)
-    assert result.returncode == code and "Traceback" not in result.stderr, result.stdout + result.stderr
-    return result.stdout if code == 0 else result.stderr
 
 
 @pytest.mark.slow
