@@ -66,11 +66,10 @@ class CaptureTab(Tab):
             time.sleep(0.7)
 
     def click(self, place):
-        """Click at the screen position of a point and wait for the effect."""
+        """Click at the screen position of a point and wait for the effect; clicks leave the camera where it is."""
         wanted = self.page._wanted
         self.web.mouse.click(*self.pixel(place))
-        until(lambda: self.page._wanted > wanted)
-        self.settle()
+        until(lambda: self.page._wanted > wanted and not self.page.busy)
 
     def view(self, name):
         """Show one camera, or all of them."""
