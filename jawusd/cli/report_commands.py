@@ -173,6 +173,7 @@ def view(
         bool, typer.Option("--play/--no-play", help="Begin by playing the captured take of a rig, if it has one.")
     ] = True,
     page: PageOption = None,
+    footage: Annotated[bool, typer.Option("--footage", help="Also write the footage of the take into --page.")] = False,
     force: Force = False,
     allow_outside: Outside = False,
     prim: Prim = None,
@@ -190,8 +191,10 @@ def view(
         raise typer.BadParameter("--tracks needs a capture, not a rig.")
     if prim is not None and capture:
         raise typer.BadParameter("--prim needs a rig, not a capture.")
+    if footage and page is None:
+        raise typer.BadParameter("--footage needs --page; the viewer shows footage by itself.")
     if page is not None:
-        _write_page(rig, page, force, prim)
+        _write_page(rig, page, force, prim, footage)
         return
     _warn_of_host(host, capture)
     for folder in (rig, tracks):
@@ -219,7 +222,7 @@ def _serve(viewer: PageServer, browser: bool) -> None:
         viewer.stop()
 
 
-def _write_page(rig: Path, page: Path, force: bool, prim: str | None) -> None:
+def _write_page(rig: Path, page: Path, force: bool, prim: str | None, footage: bool) -> None:
     """Write the web page of a rig that needs no server."""
     from jawusd.pipeline.pose_page import write_page
     from jawusd.pipeline.view_capture import is_capture
@@ -227,7 +230,7 @@ def _write_page(rig: Path, page: Path, force: bool, prim: str | None) -> None:
     if is_capture(rig):
         raise typer.BadParameter("--page needs a rig, not a capture.")
     refuse_existing(page, force)
-    write_page(rig, page, prim)
+    write_page(rig, page, prim, footage=footage)
     say(f"{page}  ({page.stat().st_size / 1e6:.1f} MB; opens in any browser)")
 
 

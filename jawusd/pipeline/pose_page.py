@@ -4,21 +4,32 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jawusd.base.errors import explain_missing_packages
+from jawusd.base.errors import CaptureError, explain_missing_packages
 from jawusd.formats.mesh import Mesh
 from jawusd.formats.report import ReplayPart
 from jawusd.geometry.se3 import transform_points
 from jawusd.pipeline.view import ContactView, rig_file, viewed_actor
 
+if TYPE_CHECKING:
+    from jawusd.report.pose_page import PageFootage
+
+# Size of an image (width, height), maximum number of images per camera, and their JPEG quality: 1 MB per camera.
+_TILE_PX, _MOST_IMAGES, _QUALITY = (320, 240), 150, 50
+
 
 @explain_missing_packages()
-def write_page(path: str | os.PathLike[str], out: Path, prim: str | None = None) -> None:
-    """Write a page that poses the rig at a path; the arguments and further errors are those of `viewed_actor`.
+def write_page(path: str | os.PathLike[str], out: Path, prim: str | None = None, *, footage: bool = False) -> None:
+    """Write a page that poses the rig at a path; other arguments and further errors are those of `viewed_actor`.
+
+    Args:
+        footage: also write the footage of the take into the page.
 
     Raises:
+        CaptureError: there is no footage, or it cannot be decoded.
         OutputError: the file cannot be written.
         RigError: the contacts of the teeth cannot be computed from the rig's meshes.
         MissingDependencyError: a package is missing.
@@ -49,5 +60,28 @@ def write_page(path: str | os.PathLike[str], out: Path, prim: str | None = None)
         first=0 if clip is None else round(clip.span[0]),
         fps=actor.fps if clip is None else clip.fps,
         teeth=ContactView(file, rig, str(describe(file, prim)["prim"])).teeth() if painted else None,
+        footage=_footage(file.parent) if footage else None,
     )
     write_pose_page(out, page)
+
+
+def _footage(folder: Path) -> PageFootage:
+    """Return the footage of a build's take, reduced in size and frame rate."""
+    from jawusd.media.overlay import encode_jpeg
+    from jawusd.pipeline.view_footage import take_footage
+    from jawusd.report.pose_page import PageFootage
+
+    taken = take_footage(folder, _TILE_PX)
+    if taken is None:
+        raise CaptureError(
+            "the footage of the take is not there: this is not the folder of a build, or its capture was moved.",
+            path=folder,
+            hint="Build the rig again, or leave out --footage.",
+        )
+    first, last = taken.frames
+    step = -(-(last - first + 1) // _MOST_IMAGES)
+    images = {
+        name: tuple(encode_jpeg(taken.picture(name, frame), _QUALITY) for frame in range(first, last + 1, step))
+        for name in taken.cameras
+    }
+    return PageFootage(images, first, step)

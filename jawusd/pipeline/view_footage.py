@@ -26,8 +26,8 @@ _TRACKS = "tracks.npz"
 _TILE_PX = (480, 360)
 
 
-def take_footage(folder: Path) -> ViewedFootage | None:
-    """Return the footage, or the masks, of the take from which a rig was built.
+def take_footage(folder: Path, tile_px: tuple[int, int] = _TILE_PX) -> ViewedFootage | None:
+    """Return the footage, or the masks, of the take from which a rig was built, in images of a size (width, height).
 
     Returns None if the folder is not that of a build, or if the capture that the build records cannot be read, as after
     the rig was moved.
@@ -51,14 +51,14 @@ def take_footage(folder: Path) -> ViewedFootage | None:
     if not names or not set(names) <= set(offsets) or not len(tracks.frames):
         return None
     frames = int(tracks.frames[0]), int(tracks.frames[-1])
-    return ViewedFootage(tuple(names), frames, _Take(facts.capture, offsets, tracks).picture)
+    return ViewedFootage(tuple(names), frames, _Take(facts.capture, offsets, tracks, tile_px).picture)
 
 
 class _Take:
     """Draws the images of a take, cropped to the teeth, with outlines of the tracked teeth; thread-safe."""
 
-    def __init__(self, capture: Capture, offsets: dict[str, int], tracks: Tracks) -> None:
-        self._capture, self._offsets, self._tracks = capture, offsets, tracks
+    def __init__(self, capture: Capture, offsets: dict[str, int], tracks: Tracks, tile_px: tuple[int, int]) -> None:
+        self._capture, self._offsets, self._tracks, self._tile_px = capture, offsets, tracks, tile_px
         self._walls: dict[str, CameraWall] = {}
         self._lock = threading.Lock()
 
@@ -89,5 +89,5 @@ class _Take:
         one = self._capture.model_copy(update={"cameras": (source,)})
         cameras = {camera.name: camera for camera in tracked_cameras(load_cameras(self._capture), self._tracks)}
         backdrops = open_backdrops(one, self._offsets)
-        self._walls[name] = CameraWall({name: cameras[name]}, backdrops, self._tracks, self._scans, _TILE_PX)
+        self._walls[name] = CameraWall({name: cameras[name]}, backdrops, self._tracks, self._scans, self._tile_px)
         return self._walls[name]

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import base64
 import os
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -27,6 +29,15 @@ _SCRIPTS = ("scene.js", "decoder.js", "contacts.js", "drag.js", "keys.js", "time
 
 
 @dataclass(frozen=True, eq=False)
+class PageFootage:
+    """The footage of the take."""
+
+    cameras: Mapping[str, tuple[bytes, ...]]  # JPEG images by camera
+    first: int  # frame of the first image
+    step: int  # number of frames for which each image is shown
+
+
+@dataclass(frozen=True, eq=False)
 class PosePage:
     """Contents of the page that poses a rig."""
 
@@ -38,6 +49,7 @@ class PosePage:
     first: int  # first frame of the take
     fps: float  # frame rate of the take, and of keys
     teeth: Teeth | None = None  # both arches, whose contacts are painted; None without contacts
+    footage: PageFootage | None = None
 
 
 def write_pose_page(path: str | os.PathLike[str], page: PosePage) -> None:
@@ -83,6 +95,14 @@ def pose_data(page: PosePage) -> dict[str, object]:
         "tolerance": rig.tolerance_mm,
         "traced": landmarks[list(TRACED)].round(3).tolist(),
         "contact": None if clearance is None or page.teeth is None else contact_data(clearance, page.teeth),
+        "footage": None if page.footage is None else _footage_data(page.footage),
         "centre": (0.5 * (low + high)).round(2).tolist(),
         "radius": round(float(np.linalg.norm(high - low)) / 2, 2),
     }
+
+
+def _footage_data(footage: PageFootage) -> dict[str, object]:
+    texts = {
+        name: [base64.b64encode(image).decode("ascii") for image in images] for name, images in footage.cameras.items()
+    }
+    return {"cameras": texts, "first": footage.first, "step": footage.step}

@@ -1,14 +1,18 @@
 """The page that poses and keys a rig without a server, opened from disk in a browser: its jaw is the evaluator's."""
 
+import base64
 import io
 import json
+import shutil
 
 import numpy as np
 import pytest
 from browser import headless_chromium, keep_picture, open_page
 from PIL import Image
 from run_jawusd import run
+from viewed_example import EXAMPLE, record_build
 
+from jawusd.base.errors import CaptureError
 from jawusd.evaluator.interpolation import interpolate_smooth
 from jawusd.evaluator.motions import motions_of_poses
 from jawusd.formats.keys import load_keys
@@ -50,7 +54,7 @@ class Jaw:
         keep_picture(self.web, name, full_page=True)
         self.web.context.close()
         assert self.trouble == []
-        assert [url for url in self.requests if not url.startswith("blob:")] == self.requests[:1]
+        assert [url for url in self.requests if not url.startswith(("blob:", "data:"))] == self.requests[:1]
 
     def pose(self):
         """Return d (3,) [mm] and the motion (4, 4) that the page shows."""
@@ -332,3 +336,43 @@ def test_the_command_writes_the_page_and_keeps_other_files(tmp_path):
     run("view", "--page", tmp_path / "jaw.html")
     assert (tmp_path / "jaw.html").stat().st_size < 3e6
     assert "--force" in run("view", "--page", tmp_path / "jaw.html", code=10)
+    assert "needs --page" in run("view", "--footage", code=2)
+    said = run("view", "--page", tmp_path / "other.html", "--footage", code=5)
+    assert "leave out --footage" in said and not (tmp_path / "other.html").exists()
+
+
+@pytest.fixture(scope="module")
+def filmed(tmp_path_factory):
+    """Write the page of a rig whose folder records the example capture, with footage."""
+    folder = shutil.copytree(EXAMPLE_RIG.parent, tmp_path_factory.mktemp("filmed") / "rig")
+    page = folder / "jaw.html"
+    with pytest.raises(CaptureError, match="is not there"):
+        write_page(folder, page, footage=True)
+    record_build(folder, EXAMPLE)
+    write_page(folder, page, footage=True)
+    return page
+
+
+def test_the_footage_of_the_frame_is_shown_beside_the_jaw(chromium, filmed):
+    jaw = Jaw(chromium, filmed)
+    image = jaw.part("footage")
+    seen = []
+    for frame in (24, 44):
+        jaw.seek(frame)
+        seen.append(image.get_attribute("src"))
+        shown = Image.open(io.BytesIO(base64.b64decode(seen[-1].partition(",")[2])))
+        assert image.is_visible() and shown.width == 320
+    jaw.part("camera").select_option("cam1")
+    seen.append(image.get_attribute("src"))
+    assert len(set(seen)) == 3
+    jaw.part("camera").select_option("off")
+    assert not image.is_visible()
+    jaw.close("pose_page_footage")
+
+
+def test_pages_without_footage_have_no_menu_and_phones_begin_without(chromium, file, filmed):
+    bare, phone = Jaw(chromium, file), Jaw(chromium, filmed, 390, 844)
+    assert bare.part("camera").count() == bare.part("footage").count() == 0
+    assert phone.part("camera").input_value() == "" and not phone.part("footage").is_visible()
+    bare.close("pose_page_without_footage")
+    phone.close("pose_page_footage_390")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import numpy as np
 from package_copy import ROOT
 
 from jawusd.formats.tracks import LOST, PARTIAL, TRACKED, LostReason, Tracks, save_tracks
+from jawusd.pipeline.state import BuildState
 
 EXAMPLE = ROOT / "examples" / "capture"
 FIRST, STOP = 20, 50
@@ -44,6 +46,16 @@ def write_true_tracks(path: Path, cameras: tuple[str, ...] = ("cam0", "cam1", "c
         matched_px=np.zeros((count, 2)), camera_names=cameras, lost_reason=reason, lost_value=value, lost_limit=limit,
     ))  # fmt: skip
     return path
+
+
+def record_build(folder: Path, capture: Path) -> Path:
+    """Let a rig's folder be that of a build of a capture, with tracks that are the truth."""
+    write_true_tracks(folder / "tracks.npz")
+    known, state = truth(), BuildState(folder)
+    offsets = {str(name): int(k) for name, k in zip(known["camera_names"], known["offsets"], strict=True)}
+    state.finish("sync", "", [], 0.0, {"offsets": offsets})
+    state.finish("report", "", [], 0.0, {"capture": os.path.relpath(capture, folder)})
+    return folder
 
 
 def copy_example(folder: Path) -> Path:

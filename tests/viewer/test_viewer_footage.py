@@ -1,30 +1,18 @@
 """Footage of the take beside the jaw: the timeline's frame, the menu's camera, and nothing without a capture."""
 
-import os
 import shutil
 
 import numpy as np
 import pytest
 from browser_tab import Tab, until
-from viewed_example import EXAMPLE, FIRST, truth, write_true_tracks
+from viewed_example import EXAMPLE, FIRST, record_build
 
 from jawusd.media.overlay import UPPER_COLOUR
-from jawusd.pipeline.state import BuildState
 from jawusd.pipeline.view import open_viewer
 from jawusd.pipeline.view_footage import take_footage
 from jawusd.viewer.footage_panel import OFF
 
 CAMERAS = ("cam0", "cam1", "cam2")
-
-
-def record_build(folder, capture):
-    """Let a rig's folder be that of a build of a capture."""
-    write_true_tracks(folder / "tracks.npz")
-    known, state = truth(), BuildState(folder)
-    offsets = {str(name): int(k) for name, k in zip(known["camera_names"], known["offsets"], strict=True)}
-    state.finish("sync", "", [], 0.0, {"offsets": offsets})
-    state.finish("report", "", [], 0.0, {"capture": os.path.relpath(capture, folder)})
-    return folder
 
 
 @pytest.fixture

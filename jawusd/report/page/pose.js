@@ -71,6 +71,17 @@
     pen.fill();
   };
 
+  // -- footage of the take at the frame; phones begin without -----------------------------------------------------------
+  const camera = find("camera"), picture = find("footage");
+  const showFootage = () => {
+    if (!camera) return;
+    const image = data.footage.cameras[camera.value]?.[Math.floor((frame - data.footage.first) / data.footage.step)];
+    picture.hidden = !image;
+    if (image) picture.src = `data:image/jpeg;base64,${image}`;
+  };
+  if (camera && !matchMedia("(max-width: 40rem)").matches) camera.selectedIndex = 1;
+  camera?.addEventListener("change", showFootage);
+
   // -- showing a pose ------------------------------------------------------------------------------------------------
   let now = [0, 0, 0], frame = span[0], running = false, started = 0, from = 0, held = null;
   const draw = () => {
@@ -104,6 +115,7 @@
     const there = keys.find(at) ? at : null;
     find("delete").disabled = there === null;
     timeline.show(at, there);
+    showFootage();
     if (keyed()) {
       const d = keys.at(at);
       if (d) show(d);
