@@ -35,7 +35,10 @@ EXAMPLES = {
         "jawusd solve out shot -o take.npz --overlay take.mp4 --report take.html",
         "jawusd solve out shot --skin skin.npz --face face.csv -o take.npz",
     ),
-    "live": ("jawusd live out shot --source left=/dev/video0 --osc 127.0.0.1:9000 --view",),
+    "live": (
+        "jawusd live out shot --source left=/dev/video0 --osc 127.0.0.1:9000 --view",
+        "face_tracker | jawusd live out shot --source left=/dev/video0 --skin skin.npz --face -",
+    ),
     "rebake": ("jawusd rebake shot.usda -o jaws.usdc", "jawusd rebake out export.fbx -o anim_edited.usdc"),
     "arkit-fit": ("jawusd arkit-fit out face.csv take.npz -o arkit.json",),
     "arkit-table": ("jawusd arkit-table out --mapping arkit.json -o joint.csv",),

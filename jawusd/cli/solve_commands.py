@@ -16,7 +16,12 @@ from jawusd.formats.atomic import refuse_existing
 from jawusd.formats.finding import Finding
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from jawusd.pipeline.live_frame import LiveFrame, OscSender
     from jawusd.pipeline.solve import SolveSummary
+    from jawusd.pipeline.solve_videos import SkinOptions
+    from jawusd.viewer.server import Viewer
 
 
 class Head(StrEnum):
@@ -70,6 +75,21 @@ FaceOffset = Annotated[
         help="Time from frame 0 of the shot to frame 0 of the face [s]. Default: estimated from visible teeth."
     ),
 ]
+LiveFaceFile = Annotated[
+    Path | None,
+    typer.Option(
+        help="The live face with the points or columns of --skin: - for the standard input, a pipe or a growing CSV. "
+        "For recorded cameras, a recording as for skin-fit.",
+        show_default=False,
+    ),
+]
+LiveFaceOffset = Annotated[
+    float,
+    typer.Option(
+        help="Time to add to the times of the face [s]: negative if the face arrives later than the images. For a "
+        "recording, the time from the first images to frame 0 of the face."
+    ),
+]
 SkinOnly = Annotated[bool, typer.Option("--skin-only", help="Ignore the images: no frame of the shot shows the teeth.")]
 
 
@@ -100,14 +120,8 @@ def solve(
 ) -> None:
     """Track a performance of a subject with a rig, from masks or, without masks, videos of one or more cameras."""
     from jawusd.pipeline import solve as stage
-    from jawusd.pipeline.solve_videos import SkinOptions
 
-    given = None
-    if skin is not None and face is not None:
-        bodies = rigid_bodies(rigid)
-        given = SkinOptions(skin, face, face_fps, offset, length_unit.value, bodies, rest_frame, skin_only)
-    elif skin is not None or face is not None or skin_only:
-        raise typer.BadParameter("needs both --skin and --face.", param_hint="--skin")
+    given = _skin_options(skin, face, face_fps, offset, rigid, rest_frame, length_unit, skin_only)
     stage.check_output(rig, out, overlay, report)
     written = [path for path in (out, overlay, report) if path is not None]
     for path in written:
@@ -132,6 +146,26 @@ def solve(
     emit({**summary, "file": str(out), "files": files}, as_json, lambda: [*files, *solve_lines(summary)])
 
 
+def _skin_options(
+    skin: Path | None,
+    face: Path | None,
+    fps: float | None,
+    offset_s: float | None,
+    rigid: list[str] | None,
+    rest_frame: int | None,
+    unit: LengthUnit,
+    only: bool = False,
+) -> SkinOptions | None:
+    """Return the options about facial skin; None without it."""
+    from jawusd.pipeline.solve_videos import SkinOptions
+
+    if skin is not None and face is not None:
+        return SkinOptions(skin, face, fps, offset_s, unit.value, rigid_bodies(rigid), rest_frame, only)
+    if skin is not None or face is not None or only:
+        raise typer.BadParameter("needs both --skin and --face.", param_hint="--skin")
+    return None
+
+
 _LISTED_RUNS = 20
 
 
@@ -143,6 +177,7 @@ def solve_lines(summary: SolveSummary) -> list[str]:
         lines.append(f"  the face starts {summary['skin_offset_s']:.3f} s after frame 0 of the shot")
     for word, runs in (
         ("estimated from facial skin", summary["skin"]),
+        ("  with an unfamiliar face, so that sigma is a rough guess", summary.get("unfamiliar", [])),
         ("interpolated from the motion around", summary["carried"]),
         ("lost", summary["lost"]),
     ):
@@ -183,6 +218,13 @@ def live(
     seconds: Annotated[
         float | None, typer.Option(min=0.1, help="Stop after this time [s].", show_default=False)
     ] = None,
+    skin: SkinFile = None,
+    face: LiveFaceFile = None,
+    face_fps: FaceFps = None,
+    offset: LiveFaceOffset = 0.0,
+    rigid: Rigid = None,
+    rest_frame: RestFrame = None,
+    length_unit: UnitOption = LengthUnit.mm,
     silence: Annotated[float, typer.Option(min=0.1, help="Maximum time without an image from a source [s].")] = 10.0,
     jobs: Annotated[int, typer.Option(min=1, max=64, help="Number of threads.")] = 2,
     allow_outside: Outside = False,
@@ -191,29 +233,38 @@ def live(
 ) -> None:
     """Track the jaw of a subject with a rig in live video; results are one line of JSON per frame, OSC, and a web page.
 
-    Frames are dropped if images arrive faster than they are tracked; every line contains the latency.
+    Frames are dropped if images arrive faster than they are tracked; every line contains the latency. With --skin and
+    --face, frames with hidden teeth are estimated from facial skin.
     """
-    from jawusd.pipeline.live import OscSender
     from jawusd.pipeline.live import live as follow
+    from jawusd.pipeline.live_frame import OscSender
     from jawusd.pipeline.view import open_viewer
 
+    given = _skin_options(skin, face, face_fps, offset, rigid, rest_frame, length_unit)
     sources = dict(_named(entry) for entry in source or [])
     sender = None if osc is None else OscSender(osc)
     viewer = open_viewer(rig, "127.0.0.1", port, prim, play=False) if view else None
     if viewer is not None:
         say(f"{viewer.url}  (Ctrl+C stops)", err=True)
+    results = follow(
+        rig,
+        shot,
+        sources,
+        prim=prim,
+        fixed_head=head is Head.fixed,
+        jobs=jobs,
+        seconds=seconds,
+        silence_s=silence,
+        allow_outside=allow_outside,
+        skin=given,
+    )
+    _show(results, sender, viewer)
+
+
+def _show(results: Iterator[LiveFrame], sender: OscSender | None, viewer: Viewer | None) -> None:
+    """Print and send live results as they come, until they end or the user stops the command."""
     try:
-        for found in follow(
-            rig,
-            shot,
-            sources,
-            prim=prim,
-            fixed_head=head is Head.fixed,
-            jobs=jobs,
-            seconds=seconds,
-            silence_s=silence,
-            allow_outside=allow_outside,
-        ):
+        for found in results:
             if sender is not None:
                 sender.send(found)
             if viewer is not None:

@@ -6,7 +6,8 @@ the principal components of the columns over `scale`, its covariance function is
     k(f, g) = smooth exp(-|f_s - g_s|^2 / (2 length^2)) + linear f . g
 
 where the first part uses the first `smooth_count` components, and the second part also the components that were left
-out. The arrays of the file, for M training frames, K columns, C components:
+out. Beyond the limit of a familiar face, the variance is multiplied by the squared distance from the components over
+that limit. The arrays of the file, for M training frames, K columns, C components:
 
     mean (K,), basis (C, K)      mean of the columns, and orthonormal principal directions
     scale ()                     standard deviation of the first component, unit of the columns
@@ -58,9 +59,8 @@ class SkinJaw(NamedTuple):
 
     Attributes:
         d: Jaw parameters [mm], shape (..., 3), not projected to the rig's bound; NaN where a column is not finite.
-        covariance: Covariance of d [mm^2], shape (..., 3, 3).
-        familiar: Whether the face resembles the training frames, shape (...); if not, d may be wrong by more than its
-            covariance indicates.
+        covariance: Covariance of d [mm^2], shape (..., 3, 3); it grows with the distance from the training frames.
+        familiar: Whether the face resembles the training frames, shape (...); if not, the covariance is a rough guess.
     """
 
     d: Array
@@ -144,8 +144,9 @@ class Skin:
         variance = np.maximum(prior - ((k @ self._precision) * k).sum(axis=1), kernel[3])
         # change of d [mm] per standard deviation of each head error, shape (n, 3, R)
         moved = self._gradient(f, smooth) @ self.arrays["head_error"].T
-        covariance = variance[:, None, None] * self.arrays["spread"] + moved @ np.swapaxes(moved, 1, 2)
         outside = left_out + (f[:, self._inside :] ** 2).sum(axis=1)
+        wider = np.maximum(outside / self.arrays["familiar_limit"][1], 1.0)
+        covariance = (wider * variance)[:, None, None] * self.arrays["spread"] + moved @ np.swapaxes(moved, 1, 2)
         return np.column_stack([d, covariance.reshape(-1, 9), variance, outside])
 
     def _gradient(self, f: Array, smooth: Array) -> Array:

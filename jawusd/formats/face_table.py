@@ -17,7 +17,7 @@ import numpy as np
 
 from jawusd.base.arrays import Array
 from jawusd.base.errors import FormatError
-from jawusd.base.tables import TextTable, read_table, read_text, split_rows
+from jawusd.base.tables import TextTable, check_width, read_table, read_text, split_rows
 
 _MAX_BYTES = 1 << 30
 _CLOCKS = ("frame", "time_s")
@@ -68,7 +68,30 @@ def read_face_table(path: str | os.PathLike[str]) -> FaceTable:
         FormatError: there is not exactly one column `frame` or `time_s`, there are no other columns, a cell is not a
             number, or frames or times do not increase.
     """
-    table = read_table(Path(path), _MAX_BYTES)
+    return _face_of(read_table(Path(path), _MAX_BYTES))
+
+
+def read_face_row(header: str, row: str, number: int, path: str | os.PathLike[str]) -> FaceTable:
+    """Read one row of a face table, for tables that are read while they are written.
+
+    Args:
+        header: the first line of the table.
+        row: another line.
+        number: number of that line in the table.
+        path: the table, for messages.
+
+    Raises:
+        FormatError: as for `read_face_table`.
+    """
+    path = Path(path)
+    rows, _ = split_rows(f"{header}\n{row}", path)
+    table = TextTable(path, [name.strip() for name in rows[0][1]], [rows[-1][1]], [f"line {number}"])
+    check_width(table, 0)
+    return _face_of(table)
+
+
+def _face_of(table: TextTable) -> FaceTable:
+    """Return the columns or points of a table; see `read_face_table`."""
     lower = [name.lower() for name in table.header]
     clocks = [k for k, name in enumerate(lower) if name in _CLOCKS]
     others = [k for k in range(len(lower)) if k not in clocks]
@@ -80,10 +103,10 @@ def read_face_table(path: str | os.PathLike[str]) -> FaceTable:
         )
     clock = lower.index("time_s") if "time_s" in lower else clocks[0]
     frames = table.numbers([clock])[:, 0]
-    steps = np.diff(frames)
-    if not (np.isfinite(frames).all() and (steps > 0).all()):
-        row = int(np.argmax(~(steps > 0))) + 1
-        raise FormatError(f"{table.named(min(row, len(frames) - 1), clock)} does not increase.", path=table.path)
+    wrong = ~np.isfinite(frames)
+    wrong[1:] |= ~(np.diff(frames) > 0)
+    if wrong.any():
+        raise FormatError(f"{table.named(int(np.argmax(wrong)), clock)} does not increase.", path=table.path)
     filled = [[cell if cell.strip() else "nan" for cell in row] for row in table.rows]
     X = TextTable(table.path, table.header, filled, table.places).numbers(others)
     X[~np.isfinite(X)] = np.nan

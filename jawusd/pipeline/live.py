@@ -7,13 +7,13 @@ import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from contextlib import ExitStack
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 import jawusd
-from jawusd.base.arrays import Array
-from jawusd.base.errors import CaptureError, OutputError, explain_missing_packages, naming_file
+from jawusd.base.errors import CaptureError, explain_missing_packages, naming_file
 from jawusd.evaluator import JawRig
 from jawusd.formats.capture import Capture
 from jawusd.formats.performance import SolveState
@@ -22,59 +22,24 @@ from jawusd.pipeline.calibrate import sync_cameras
 from jawusd.pipeline.cameras import load_cameras
 from jawusd.pipeline.capture_inputs import open_capture
 from jawusd.pipeline.follow import Cutter
+from jawusd.pipeline.live_frame import LiveFrame, LiveJaw
+from jawusd.pipeline.live_skin import LiveSkin
 from jawusd.pipeline.picture_search import LEAST_FIT, arches_apart, masked_cameras, orientations
-from jawusd.pipeline.solve_videos import PreparedTeeth, VideoOptions, VideoShot
+from jawusd.pipeline.solve_videos import PreparedTeeth, SkinOptions, VideoOptions, VideoShot
 from jawusd.pipeline.state import no_progress
 from jawusd.pipeline.subject import load_labelled, registered_meshes
 
 if TYPE_CHECKING:
     from jawusd.media.live_source import LiveSource
     from jawusd.segmentation.picture import Pictures
-    from jawusd.tracking.performance.attempts import FrameFit
     from jawusd.tracking.performance.coordinates import Pose
 
 
 _PATIENCE_S = 2.0  # time without visible teeth [s] after which a new search begins
 _WAIT_S = 0.25
 _MOST_BEHIND_S = 0.15  # lag behind the newest images [s] above which frames are dropped
+_UNKNOWN_MM = 10.0  # standard deviation of d in frames in which only the skin is known [mm]
 _BEFORE = 6  # number of frames tracked before playback of files begins, to estimate the motion
-
-
-@dataclass(frozen=True, eq=False)
-class LiveFrame:
-    """Result of one frame, which consists of the images of all sources at one time.
-
-    Attributes:
-        time_s: capture time of the images [s] since the start of the sources; for files, since their first images.
-        d, sigma: jaw parameters and their standard deviations [mm], shape (3,).
-        margin_mm: signed distance to the rig's bound [mm], positive inside.
-        verdict: the rig's verdict on the pose.
-        state: name of the `SolveState`, solved or carried.
-        latency_ms: time from the capture of the images to this result [ms].
-        dropped: number of frames dropped since the last result.
-    """
-
-    time_s: float
-    d: Array
-    sigma: Array
-    margin_mm: float
-    verdict: str
-    state: str
-    latency_ms: float
-    dropped: int
-
-    def as_json(self) -> dict[str, object]:
-        """Return the result as JSON-serialisable values, rounded to significant digits."""
-        return {
-            "time_s": round(self.time_s, 4),
-            "d": [round(value, 3) for value in self.d.tolist()],
-            "sigma": [round(value, 3) for value in self.sigma.tolist()],
-            "margin_mm": round(self.margin_mm, 3),
-            "verdict": self.verdict,
-            "state": self.state,
-            "latency_ms": round(self.latency_ms, 1),
-            "dropped": self.dropped,
-        }
 
 
 @explain_missing_packages()
@@ -89,6 +54,7 @@ def live(
     seconds: float | None = None,
     silence_s: float = 10.0,
     allow_outside: bool = False,
+    skin: SkinOptions | None = None,
 ) -> Iterator[LiveFrame]:
     """Yield one result per frame; frames are dropped if images arrive faster than they are tracked.
 
@@ -103,9 +69,11 @@ def live(
         seconds: duration after which tracking stops [s]; None: when the sources end.
         silence_s: maximum time without an image from a device or stream [s].
         allow_outside: allow paths in the capture that point outside its folder.
+        skin: facial skin, which determines d in frames with hidden teeth; see `LiveSkin`.
 
     Raises:
-        FormatError, RigError: the rig cannot be read.
+        FormatError, RigError: the rig, or a file of the skin, cannot be read.
+        FittingError: the skin contradicts the visible teeth.
         CaptureError, CalibrationError, SyncError: the shot or a source cannot be read.
         TrackingError: the scans are not in occlusion.
     """
@@ -113,7 +81,7 @@ def live(
     jaw = jawusd.load(rig, prim=prim)
     with ExitStack() as stack:
         pool = stack.enter_context(ThreadPoolExecutor(jobs))
-        follower = _Follower(capture, jaw, sources or {}, fixed_head, pool)
+        follower = _Follower(capture, jaw, sources or {}, fixed_head, pool, skin)
         stack.callback(follower.stop)
         yield from follower.run(seconds, silence_s)
 
@@ -164,7 +132,13 @@ class _Follower:
     """Tracker of the teeth in live sources."""
 
     def __init__(
-        self, capture: Capture, jaw: JawRig, sources: Mapping[str, str], fixed_head: bool, pool: Executor
+        self,
+        capture: Capture,
+        jaw: JawRig,
+        sources: Mapping[str, str],
+        fixed_head: bool,
+        pool: Executor,
+        skin: SkinOptions | None,
     ) -> None:
         from jawusd.media.live_source import LiveSource
         from jawusd.tracking.region.live import LiveTake
@@ -172,6 +146,7 @@ class _Follower:
         self._capture, where = _with_sources(capture, sources)
         self._jaw, self._period_s = jaw, 1.0 / capture.fps
         self._files = all(Path(one).is_file() for one in where.values())
+        self._skin = None if skin is None else LiveSkin(jaw, skin, recorded=self._files)
         self._offsets = dict.fromkeys(where, 0)
         if self._files:
             self._offsets = sync_cameras(self._capture, no_progress)["offsets"]
@@ -188,11 +163,14 @@ class _Follower:
             for name, camera in self._cameras.items()
         }
         self._cutter: Cutter | None = None
+        self._last_d = np.zeros(3)
 
     def stop(self) -> None:
         """Stop reading the sources."""
         for source in self._sources.values():
             source.stop()
+        if self._skin is not None:
+            self._skin.stop()
 
     def run(self, seconds: float | None, silence_s: float) -> Iterator[LiveFrame]:
         """Yield one result per frame until the sources end."""
@@ -204,32 +182,55 @@ class _Follower:
         begin = live_clock.now_s() - start * self._period_s
         for source in self._sources.values():
             source.play(begin)
+        if self._skin is not None:
+            self._skin.play(begin, silence_s)
         last, blind_since = begin + (start - 0.5) * self._period_s, 0.0
         while (at := self._next(last, silence_s)) is not None:
             if seconds is not None and at - begin > start * self._period_s + seconds:
                 return
-            pictures = self._pictures(at)
+            pictures, passed_s, last = self._pictures(at), at - last, at
             if self._cutter is None or 0 < blind_since < at - _PATIENCE_S:
                 self._begin_in_pictures(pictures)
-                blind_since, last = 0.0, at
-                continue
-            frames = max(1.0, (at - last) / self._period_s)
-            fit = self._take.step(self._cutter.cut(pictures), frames)
-            blind_since = 0.0 if fit.found.all() else blind_since or at
-            last = at
-            yield self._result(fit, at, begin, round(frames) - 1)
+                blind_since = 0.0
+                jaw = self._without_teeth(at, passed_s)
+            else:
+                jaw = self._tracked(self._cutter, pictures, at, passed_s)
+                blind_since = 0.0 if jaw.state == SolveState.SOLVED else blind_since or at
+            if jaw is not None:
+                yield self._result(jaw, at, begin, round(max(1.0, passed_s / self._period_s)) - 1)
 
-    def _result(self, fit: FrameFit, at: float, begin: float, dropped: int) -> LiveFrame:
-        verdict = self._jaw.validate_parameters(fit.pose.d[None], tolerance_mm=None)
+    def _tracked(self, cutter: Cutter, pictures: Pictures, at: float, passed_s: float) -> LiveJaw:
+        """Return the jaw in images taken `passed_s` [s] after the previous ones."""
+        fit = self._take.step(cutter.cut(pictures), max(1.0, passed_s / self._period_s))
+        state = SolveState.SOLVED if fit.found.all() else SolveState.CARRIED
+        jaw = LiveJaw(fit.pose.d, self._take.covariance_d(fit), state)
+        if self._skin is not None:
+            jaw = self._skin.fuse(at, jaw, passed_s)
+            if jaw.state == SolveState.SKIN:
+                self._take.carry(jaw.d, jaw.covariance)
+        self._last_d = jaw.d
+        return jaw
+
+    def _without_teeth(self, at: float, passed_s: float) -> LiveJaw | None:
+        """Return the jaw by skin alone, in a frame in which the teeth are searched for; None if it is unknown."""
+        if self._skin is None:
+            return None
+        unknown = LiveJaw(self._last_d, _UNKNOWN_MM**2 * np.eye(3), SolveState.CARRIED)
+        jaw = self._skin.fuse(at, unknown, passed_s)
+        return jaw if jaw.state == SolveState.SKIN else None
+
+    def _result(self, jaw: LiveJaw, at: float, begin: float, dropped: int) -> LiveFrame:
+        verdict = self._jaw.validate_parameters(jaw.d[None], tolerance_mm=None)
         return LiveFrame(
             time_s=at - begin,
-            d=fit.pose.d,
-            sigma=self._take.sigma_d(fit),
+            d=jaw.d,
+            sigma=np.sqrt(np.diag(jaw.covariance)),
             margin_mm=float(verdict.margin_mm[0]),
             verdict=verdict.words()[0],
-            state=str(SolveState.SOLVED if fit.found.all() else SolveState.CARRIED),
+            state=str(jaw.state),
             latency_ms=1e3 * (live_clock.now_s() - at),
             dropped=dropped,
+            familiar=jaw.familiar,
         )
 
     def _begin_in_files(self) -> int:
@@ -290,59 +291,3 @@ class _Follower:
         found = {name: source.at(at) for name, source in self._sources.items()}
         near = self._period_s
         return {n: None if p is None or abs(p.time_s - at) > near else p.rgb for n, p in found.items()}
-
-
-class OscSender:
-    """Sends one OSC bundle per frame over UDP.
-
-    Arguments: /jaw/d and /jaw/sigma have three floats [mm], /jaw/margin one [mm], /jaw/time one [s]; /jaw/state has the
-    integer 1 for solved or 2 for carried, as in `SolveState`.
-    """
-
-    @explain_missing_packages()
-    def __init__(self, address: str) -> None:
-        """Open a socket for HOST:PORT.
-
-        Raises:
-            OutputError: the address has no port, or the host is unknown.
-            MissingDependencyError: python-osc is not installed.
-        """
-        from pythonosc.udp_client import UDPClient
-
-        host, _, port = address.rpartition(":")
-        if not host or not port.isdecimal() or not 0 < int(port) < 65536:
-            raise OutputError(f"{address!r} is not an address.", hint="Give HOST:PORT, for example 127.0.0.1:9000.")
-        try:
-            self._client = UDPClient(host.strip("[]"), int(port))
-        except OSError as error:
-            raise OutputError(f"unknown host {host!r} ({error}).") from error
-
-    def close(self) -> None:
-        """Close the socket."""
-        self._client.close()
-
-    @explain_missing_packages()
-    def send(self, frame: LiveFrame) -> None:
-        """Send one result; it is not an error if nothing receives it."""
-        from pythonosc.osc_bundle_builder import IMMEDIATELY, OscBundleBuilder
-        from pythonosc.osc_message_builder import OscMessageBuilder
-
-        from jawusd.formats.performance import SolveState
-
-        bundle = OscBundleBuilder(IMMEDIATELY)
-        values: dict[str, list[float] | list[int]] = {
-            "d": frame.d.tolist(),
-            "sigma": frame.sigma.tolist(),
-            "margin": [frame.margin_mm],
-            "state": [int(SolveState[frame.state.upper()])],
-            "time": [frame.time_s],
-        }
-        for name, numbers in values.items():
-            message = OscMessageBuilder(f"/jaw/{name}")
-            for number in numbers:
-                message.add_arg(number)
-            bundle.add_content(message.build())
-        try:
-            self._client.send(bundle.build())
-        except OSError:  # the receiver has closed its port and may open it again
-            return

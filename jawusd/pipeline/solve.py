@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NotRequired, TypedDict, cast
 
 import numpy as np
+from numpy.typing import NDArray
 
 import jawusd
 from jawusd.base.errors import OutputError, RigError, TrackingError, explain_missing_packages, naming_file
@@ -56,6 +57,7 @@ class SolveSummary(TypedDict):
         dict[str, tuple[float, float]]
     ]  # ratio of estimated to calibrated focal length, and its standard deviation, by camera
     skin_offset_s: NotRequired[float]  # seconds from frame 0 of the shot to frame 0 of the face data
+    unfamiliar: NotRequired[list[tuple[int, int]]]  # runs of `skin` with a face unlike those of the calibration
     findings: NotRequired[list[dict[str, str | float | int]]]
 
 
@@ -118,7 +120,7 @@ def solve(
         options = VideoOptions(fixed_head, free_focal, jobs, by_skin)
         found, findings = _from_images(capture, jaw, offsets, options, progress)
     if by_skin is not None:
-        found.notes["skin_offset_s"] = by_skin.offset_s
+        found.notes |= {"skin_offset_s": by_skin.offset_s, "unfamiliar": by_skin.unfamiliar.tolist()}
     known = cast("list[dict[str, str | float | int]]", found.notes.get("findings", []))
     found.notes["findings"] = [*known, *(finding.as_json() for finding in findings)]
     if out is not None:
@@ -260,13 +262,14 @@ def solve_summary(performance: Performance) -> SolveSummary:
     solved = p.state == SolveState.SOLVED
     sigma = p.sigma_d
     typical = np.median(sigma[solved] if solved.any() else sigma, axis=0)
+    by_skin = p.frames[p.state == SolveState.SKIN]
     names = ("d1", "d2", "d3")
     summary = SolveSummary(
         frames=len(p.frames),
         solved=int(solved.sum()),
-        carried=_runs(p, SolveState.CARRIED),
-        skin=_runs(p, SolveState.SKIN),
-        lost=_runs(p, SolveState.LOST),
+        carried=_runs(p.frames[p.state == SolveState.CARRIED]),
+        skin=_runs(by_skin),
+        lost=_runs(p.frames[p.state == SolveState.LOST]),
         within_tolerance=int((p.valid & ~is_inside(p.margin_mm)).sum()),
         outside=int((~p.valid).sum()),
         cameras=list(p.camera_names),
@@ -279,13 +282,14 @@ def solve_summary(performance: Performance) -> SolveSummary:
         summary["focal"] = cast("dict[str, tuple[float, float]]", p.notes["focal"])
     if "skin_offset_s" in p.notes:
         summary["skin_offset_s"] = cast(float, p.notes["skin_offset_s"])
+        summary["unfamiliar"] = _runs(np.intersect1d(by_skin, cast("list[int]", p.notes["unfamiliar"])))
     return summary
 
 
-def _runs(p: Performance, state: SolveState) -> list[tuple[int, int]]:
-    """Return the first and the last frame of each run of frames in a given state."""
+def _runs(frames: NDArray[np.int64]) -> list[tuple[int, int]]:
+    """Return the first and the last frame of each run of consecutive frames (F,)."""
     runs: list[tuple[int, int]] = []
-    for frame in p.frames[p.state == state].tolist():
+    for frame in frames.tolist():
         if runs and runs[-1][1] == frame - 1:
             runs[-1] = (runs[-1][0], frame)
         else:

@@ -28,6 +28,7 @@ class SkinOfShot:
 
     Attributes:
         offset_s: seconds from frame 0 of the shot to frame 0 of the face data; None until it is estimated.
+        unfamiliar: frames of the last call in which the face does not resemble those from which the map was learned.
     """
 
     def __init__(self, rig: JawRig, options: SkinOptions, fps: float) -> None:
@@ -44,7 +45,7 @@ class SkinOfShot:
             raise FormatError("does not state its frame rate.", path=options.face, hint="Give it with --face-fps.")
         self._rig, self._fps, self._face = rig, fps, options.face
         self._face_s, self._columns = face.frames / face.fps, face.X.reshape(len(face.X), -1)
-        self.offset_s = options.offset_s
+        self.offset_s, self.unfamiliar = options.offset_s, np.zeros(0, np.int64)
 
     def frames(self) -> range:
         """Return the frames of the shot that the face data cover.
@@ -78,7 +79,10 @@ class SkinOfShot:
                 hint="Check that face and map have the same unit (--length-unit), that points are relative to the same "
                 "head (--rigid), and the offset of the clocks (--offset).",
             )
-        self._compare(found, d, seen)
+        self.unfamiliar = frames[np.isfinite(found.d).all(axis=1) & ~found.familiar].astype(np.int64)
+        rows = seen & found.familiar
+        if rows.sum() >= _COMPARED:
+            check_agreement(self._face, SkinJaw(found.d[rows], found.covariance[rows], rows[rows]), d[rows])
         return found
 
     def _known_offset(self) -> float:
@@ -89,22 +93,29 @@ class SkinOfShot:
             )
         return self.offset_s
 
-    def _compare(self, found: SkinJaw, d: Array, seen: Mask) -> None:
-        rows = seen & found.familiar
-        if rows.sum() < _COMPARED:
-            return
-        away = found.d[rows] - d[rows]
-        variance = np.einsum("fii->fi", found.covariance)[rows] + _FIRST_PASS_MM**2
-        apart = float((away**2 / variance).mean())
-        if apart > _MOST_APART:
-            raise FittingError(
-                f"{os.fspath(self._face)}: in {int(rows.sum())} frames with visible teeth, d from the skin differs "
-                f"from d from the teeth by {np.sqrt((away**2).mean()):.1f} mm (root mean square), "
-                f"{np.sqrt(apart):.1f} times "
-                f"the expected error; at most {np.sqrt(_MOST_APART):g} times is accepted.",
-                hint="Check that the face is of this shot, the offset of the clocks (--offset), and that the map was "
-                "learned with this rig and the same points.",
-            )
+
+def check_agreement(face: str | os.PathLike[str], found: SkinJaw, d: Array) -> None:
+    """Check that d of the skin agrees with d of visible teeth.
+
+    Args:
+        face: the file of the face, for messages.
+        found: jaw of the skin in frames with visible teeth and a familiar face.
+        d: jaw parameters measured from the teeth in these frames [mm], shape (F, 3).
+
+    Raises:
+        FittingError: they differ by much more than their expected error.
+    """
+    away = found.d - d
+    variance = np.einsum("fii->fi", found.covariance) + _FIRST_PASS_MM**2
+    apart = float((away**2 / variance).mean())
+    if apart > _MOST_APART:
+        raise FittingError(
+            f"{os.fspath(face)}: in {len(d)} frames with visible teeth, d from the skin differs "
+            f"from d from the teeth by {np.sqrt((away**2).mean()):.1f} mm (root mean square), "
+            f"{np.sqrt(apart):.1f} times the expected error; at most {np.sqrt(_MOST_APART):g} times is accepted.",
+            hint="Check that the face is of this shot, the offset of the clocks (--offset), and that the map was "
+            "learned with this rig and the same points.",
+        )
 
 
 def check_columns(skin: Skin, face: FaceTable, options: SkinOptions) -> None:

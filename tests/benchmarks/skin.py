@@ -15,6 +15,7 @@ error of head stabilisation in both [mm, degrees]. Without it, both 0 and 1 mm, 
     unrelated             error learned from another take's columns over that of the best guess; above 0.65 is refused
     every 2 s             mean, p95 and z2 behind closed lips if the lips part every 2 s and show the teeth in 3 frames,
                           fused as in `jawusd solve`; and the mean error of interpolation without skin
+    live                  the same, one frame at a time as in `jawusd live`; and the mean error with the last d held
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
 
 import argparse  # noqa: E402
 import sys  # noqa: E402
+from functools import partial  # noqa: E402
 from pathlib import Path  # noqa: E402
 
 import numpy as np  # noqa: E402
@@ -39,8 +41,10 @@ from jawusd.evaluator.skin import SkinJaw  # noqa: E402
 from jawusd.fitting import skin as fitting  # noqa: E402
 from jawusd.geometry import transform_points  # noqa: E402
 from jawusd.tracking.performance import motion  # noqa: E402
-from jawusd.tracking.performance.skin import SLOW, SkinFactor  # noqa: E402
+from jawusd.tracking.performance.attempts import LARGEST_SIGMA  # noqa: E402
+from jawusd.tracking.performance.skin import SLOW, SkinFactor, SkinFilter  # noqa: E402
 from jawusd.tracking.performance.system import TakeSystem  # noqa: E402
+from jawusd.tracking.region import live  # noqa: E402
 
 UNTRAINED = 4
 FPS, PERIOD, PARTED, SEEN, SIGMA_MM = 24.0, 48, 9, (3, 6), 0.15
@@ -57,7 +61,7 @@ def main() -> None:
         print(f"head stabilisation {head[0]:g} mm, {head[1]:g} degrees")
         print(
             "person  mean   p95  condyles    z2  held out   chin  carried  share        strange      unrelated"
-            "              every 2 s"
+            "              every 2 s                 live"
         )
         rows = np.array([scores(skin, tuple(head)) for skin in people])
         for seed, row in enumerate(rows):
@@ -68,7 +72,7 @@ def main() -> None:
 def line(row: np.ndarray) -> str:
     """Return one row of the table."""
     form = "{:4.2f}  {:4.2f}  {:8.2f}  {:4.2f}  {:8.2f}  {:5.2f}  {:7.2f}  {:5.2f}  {:5.3f} {:4.2f} {:4.2f}  {:12.2f}"
-    form += "  {:4.2f} {:4.2f} {:4.2f} {:5.2f}"
+    form += 2 * "  {:4.2f} {:4.2f} {:4.2f} {:5.2f}"
     return form.format(*row)
 
 
@@ -98,19 +102,35 @@ def scores(person: Skin, head: tuple[float, float]) -> list[float]:
 
 
 def every_2_s(person: Skin, skin: jawusd.evaluator.skin.Skin, head: tuple[float, float]) -> list[float]:
-    """Return mean, p95, z2 with skin, and the mean without, of closed lips that part every 2 s."""
+    """Return mean, p95, z2 with skin, and the mean without, of closed lips that part every 2 s; in a take, and live."""
     rng = np.random.default_rng([4, 0x2AC])
     phase = np.arange(1440) % PERIOD
     closed, seen = phase >= PARTED, (phase >= SEEN[0]) & (phase < SEEN[1])
     T = person.speech(len(phase), rng)
     true, by_skin = person.rig.encode(T).d, skin(person.points(T, rng, closed.astype(float), head=head))
     measured = true + SIGMA_MM * rng.normal(size=true.shape)
-    found, variance = fused(person.rig, measured, seen, by_skin)
-    none = by_skin._replace(familiar=np.zeros(len(phase), bool))
-    interpolated = fused(person.rig, measured, seen, none)[0]
-    error, without = (person.errors_mm(person.rig.project(d), T)[closed, 0] for d in (found, interpolated))
-    z2 = ((found - true) ** 2 / variance)[closed].mean()
-    return [error.mean(), np.quantile(error, 0.95), z2, without.mean()]
+    none = by_skin._replace(d=np.full_like(true, np.nan))
+    row: list[float] = []
+    for solved in (partial(fused, person.rig), followed):
+        found, variance = solved(measured, seen, by_skin)
+        held = solved(measured, seen, none)[0]
+        error, without = (person.errors_mm(person.rig.project(d), T)[closed, 0] for d in (found, held))
+        z2 = ((found - true) ** 2 / variance)[closed].mean()
+        row += [error.mean(), np.quantile(error, 0.95), z2, without.mean()]
+    return row
+
+
+def followed(d: np.ndarray, seen: np.ndarray, by_skin: SkinJaw) -> tuple[np.ndarray, np.ndarray]:
+    """Return d and its variances (F, 3) from d of frames with visible teeth, and skin, as it arrives."""
+    slow, found, variance = SkinFilter(), np.zeros_like(d), np.full_like(d, LARGEST_SIGMA[6] ** 2)
+    step = (live._WIDER * motion._MISS[6]) ** 2
+    for k in range(len(d)):
+        start = d[k] if seen[k] else found[k - 1]
+        size = np.full(3, SIGMA_MM**2) if seen[k] else np.minimum(variance[k - 1] + step, LARGEST_SIGMA[6] ** 2)
+        jaw = SkinJaw(*(part[k] for part in by_skin))
+        found[k], covariance, _ = slow.fuse(jaw, start, np.diag(size), seen=bool(seen[k]), seconds=1 / FPS)
+        variance[k] = np.diag(covariance)
+    return found, variance
 
 
 def fused(rig: jawusd.JawRig, d: np.ndarray, seen: np.ndarray, by_skin: SkinJaw) -> tuple[np.ndarray, np.ndarray]:
@@ -121,7 +141,7 @@ def fused(rig: jawusd.JawRig, d: np.ndarray, seen: np.ndarray, by_skin: SkinJaw)
     factor = SkinFactor(by_skin, FPS)
     zero = np.zeros_like(d)
     factor.add(system, zero, zero, 0)
-    jaw, gap = slice(0, 3), ~(seen | factor.used)
+    jaw, gap = slice(0, 3), ~(seen | factor.familiar)
     system.add_bends(jaw, zero[2:], 1.0 / (motion._LOOSE * usual))
     system.add_steps(jaw, zero[1:], (gap[1:] | gap[:-1])[:, None] / (25 * usual))
     return system.solve()[0][:, :3], np.einsum("fii->fi", system.covariance().own)[:, :3]

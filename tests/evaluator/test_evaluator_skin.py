@@ -44,7 +44,10 @@ def example_arrays(frames=40, columns=18, count=8, seed=0):
 
 
 def textbook(arrays, x):
-    """Return the mean and the variance of the process at columns x (K,), entry by entry with solves."""
+    """Return the mean and the variance of the process at columns x (K,), entry by entry with solves.
+
+    Beyond the limit of a familiar face, the variance grows with the squared distance from the components.
+    """
     length, smooth, linear, new = arrays["kernel"]
 
     def parts(y):
@@ -61,7 +64,9 @@ def textbook(arrays, x):
     f, left_out = parts(x)
     row = np.array([k(f, g) for g in train])
     mean = d.mean(axis=0) + row @ np.linalg.solve(K, d - d.mean(axis=0))
-    return mean, k(f, f) + linear * left_out + new - row @ np.linalg.solve(K, row)
+    variance = k(f, f) + linear * left_out + new - row @ np.linalg.solve(K, row)
+    outside = left_out + np.sum(f[arrays["familiar_count"] :] ** 2)
+    return mean, variance * max(1.0, outside / arrays["familiar_limit"][1])
 
 
 def test_means_and_covariances_are_those_of_the_textbook():

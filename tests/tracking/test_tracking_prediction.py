@@ -68,3 +68,19 @@ def test_a_known_head_stays_where_it_is(coordinates):
     known, _ = following(coordinates, 0.5, head=KNOWN)
     assert (known.expected().precision[:6] > 1e6 * free.expected().precision[:6]).all()
     np.testing.assert_allclose(known.expected().precision[6:], free.expected().precision[6:])
+
+
+def test_a_jaw_from_elsewhere_is_predicted_with_its_own_variance(coordinates):
+    """It replaces that of a hidden jaw until the next frame; the head is as uncertain as before."""
+    motion, last = following(coordinates, 0.5)
+    for _ in range(5):
+        motion.expected()
+        motion.take(last, np.zeros(2, bool))
+    hidden = motion.expected()
+    motion.carry(np.array([5.0, 1.0, 0.5]), np.array([0.04, 0.09, 0.01]))
+    found = motion.expected()
+    np.testing.assert_array_equal(found.pose.d, [5.0, 1.0, 0.5])
+    np.testing.assert_allclose(found.precision[6:], 1 / (0.7**2 + np.array([0.04, 0.09, 0.01])))
+    np.testing.assert_array_equal(found.precision[:6], hidden.precision[:6])
+    motion.take(found.pose, np.zeros(2, bool))
+    assert (motion.expected().precision < hidden.precision).all()

@@ -12,7 +12,7 @@ from jawusd.formats.tracks import LOST, load_tracks, save_tracks
 from jawusd.tracking.contour.scan import prepare_scan
 from jawusd.tracking.performance import skin as module
 from jawusd.tracking.performance.results import tracks_of
-from jawusd.tracking.performance.skin import SkinFactor
+from jawusd.tracking.performance.skin import SkinFactor, SkinFilter
 from jawusd.tracking.performance.skin_alone import solve_by_skin
 from jawusd.tracking.performance.system import TakeSystem
 
@@ -37,8 +37,8 @@ def test_the_factor_is_a_measurement_with_slow_and_fast_errors(count, wider):
     """The posterior of d with a prior in each frame, by the covariance of all measurements."""
     rng = np.random.default_rng(count)
     C, prior, measured = spread(rng, count), spread(rng, count), rng.normal(size=(count, 3))
-    familiar = np.arange(count) != 4
-    factor = SkinFactor(SkinJaw(measured, C, familiar), FPS, wider)
+    known = np.arange(count) != 4
+    factor = SkinFactor(SkinJaw(np.where(known[:, None], measured, np.nan), C, known), FPS, wider)
     system = TakeSystem(count, 6, 2)
     for k in range(count):
         precision = np.zeros((8, 8))
@@ -61,13 +61,46 @@ def test_the_factor_is_a_measurement_with_slow_and_fast_errors(count, wider):
     for k in range(count):
         own[k, :, k] = (1 - share) * enlarged * C[k]
         P[k, :, k] = prior[k]
-    rows = np.repeat(familiar, 3)
+    rows = np.repeat(known, 3)
     P, S = P.reshape(3 * count, -1), (error + own).reshape(3 * count, -1)
     gain = P[:, rows] @ np.linalg.inv((P + S)[np.ix_(rows, rows)])
     np.testing.assert_allclose(found.ravel(), gain @ measured.ravel()[rows], atol=1e-9)
     posterior = P - gain @ P[rows]
     for k in range(count):
         np.testing.assert_allclose(covariance[k], posterior[3 * k :, 3 * k :][:3, :3], atol=1e-9)
+
+
+def test_the_filter_finds_what_the_factor_finds_in_the_last_frame():
+    """Frames of different priors, one without a face."""
+    rng, count = np.random.default_rng(3), 7
+    C, prior, measured, d = spread(rng, count), spread(rng, count), *rng.normal(size=(2, count, 3))
+    known = np.arange(count) != 3
+    by_skin = SkinJaw(np.where(known[:, None], measured, np.nan), C, known)
+    factor, system = SkinFactor(by_skin, FPS), TakeSystem(count, 6, 0)
+    slow = SkinFilter()
+    for k in range(count):
+        precision = np.zeros((6, 6))
+        precision[:3, :3] = np.linalg.inv(prior[k])
+        system.add_frame(k, precision, np.zeros(6))
+        one = SkinJaw(*(part[k] for part in by_skin))
+        found, covariance, used = slow.fuse(one, d[k], prior[k], seen=True, seconds=1 / FPS)
+        assert used == known[k]
+    factor.add(system, d, np.zeros((count, 3)), 0)
+    np.testing.assert_allclose(found, (d + system.solve()[0][:, :3])[-1], atol=1e-9)
+    np.testing.assert_allclose(covariance, system.covariance().own[-1, :3, :3], atol=1e-9)
+
+
+def test_a_predicted_jaw_does_not_correct_the_slow_error():
+    one = SkinJaw(np.array([2.0, 0, 0]), 0.5 * np.eye(3), np.array(True))
+    zero, sure = np.zeros(3), 1e-4 * np.eye(3)
+    seen, predicted = SkinFilter(), SkinFilter()
+    seen.fuse(one, zero, sure, seen=True, seconds=0.04)
+    predicted.fuse(one, zero, sure, seen=False, seconds=0.04)
+    unknown = 100.0 * np.eye(3)
+    corrected, covariance, _ = seen.fuse(one, zero, unknown, seen=False, seconds=0.04)
+    as_told, wider, _ = predicted.fuse(one, zero, unknown, seen=False, seconds=0.04)
+    assert corrected[0] < 0.8 < 1.95 < as_told[0]
+    assert covariance[0, 0] < 0.7 * wider[0, 0]
 
 
 @pytest.fixture(scope="module")

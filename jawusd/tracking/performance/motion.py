@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from jawusd.base.arrays import Array, Mask
 from jawusd.evaluator import JawRig
 from jawusd.tracking.performance.attempts import LARGEST_SIGMA
-from jawusd.tracking.performance.coordinates import LOCAL, Coordinates, Pose
+from jawusd.tracking.performance.coordinates import JAW, LOCAL, Coordinates, Pose
 from jawusd.tracking.performance.instant import Expected
 
 # Standard deviations of predicted head rotation, head translation and jaw parameters [rad, mm, mm], for fast chewing at
@@ -54,21 +54,29 @@ class Prediction:
         self._coordinates, self._miss = coordinates, _MISS * np.r_[[head] * 6, [1.0] * 3]
         self.last, self._velocity, self._frames = begin, np.zeros(LOCAL), 1.0
         self.blind = np.where(found, 0, 1)
+        self._carried_mm2: Array | None = None
 
     def expected(self, frames: float = 1.0) -> Expected:
         """Return the pose predicted `frames` frames ahead; its variance grows while teeth are not visible."""
         self._frames = frames
-        sigma = frames * self._miss * np.sqrt(1.0 + np.r_[[self.blind[0]] * 6, [self.blind.max()] * 3])
+        steps = (frames * self._miss) ** 2
+        variance = steps * (1.0 + np.r_[[self.blind[0]] * 6, [self.blind.max()] * 3])
+        if self._carried_mm2 is not None:
+            variance[JAW] = steps[JAW] + self._carried_mm2
         reach = _DAMPING * (1.0 - _DAMPING**frames) / (1.0 - _DAMPING)
         pose = self._coordinates.moved(self.last, reach * self._velocity)
-        return Expected(pose, np.minimum(sigma, LARGEST_SIGMA) ** -2.0)
+        return Expected(pose, np.minimum(np.sqrt(variance), LARGEST_SIGMA) ** -2.0)
 
     def take(self, pose: Pose, found: Mask) -> None:
         """Update with the pose of the next frame; `found` is whether each arch was found in it, shape (2,)."""
         moved = self._coordinates.step(self.last, pose) / self._frames
         self._velocity = moved if found.all() and not self.blind.any() else np.zeros(LOCAL)
         self.blind = np.where(found, 0, self.blind + 1)
-        self.last = pose
+        self.last, self._carried_mm2 = pose, None
+
+    def carry(self, d: Array, variance_mm2: Array) -> None:
+        """Replace the jaw of the last frame by d [mm] from elsewhere, shape (3,), with variances [mm^2], shape (3,)."""
+        self.last, self._carried_mm2 = replace(self.last, d=d), variance_mm2
 
 
 @dataclass(frozen=True, eq=False)

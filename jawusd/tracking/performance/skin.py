@@ -32,7 +32,8 @@ class SkinFactor:
     """Normal equations of the skin's measurements of d.
 
     Attributes:
-        used: frames with a factor, shape (F,): those with a familiar face.
+        used: frames with a factor, shape (F,): those in which the face is known.
+        familiar: those of them in which the face resembles the training frames, shape (F,).
     """
 
     def __init__(self, skin: SkinJaw, fps: float, wider: float = 1.0) -> None:
@@ -43,19 +44,19 @@ class SkinFactor:
             fps: frames per second.
             wider: factor on all precisions, if covariances of the system are multiplied by it later.
         """
-        self.used = skin.familiar & np.isfinite(skin.d).all(axis=-1)
+        self.used: Mask = np.asarray(np.isfinite(skin.d).all(axis=-1))
+        self.familiar: Mask = np.asarray(self.used & skin.familiar)
         self._d, self._wider = skin.d, wider
         covariance = np.where(self.used[:, None, None], skin.covariance, np.eye(3))
-        self._slope = np.sqrt(_SHARE) * np.linalg.cholesky(covariance)
-        fast = (1 - _SHARE) * max(1.0, _FAST_S * fps)
-        self._precision = wider * np.linalg.inv(fast * covariance)
-        self._keep = float(np.exp(-1.0 / (_SLOW_S * fps)))
+        self._slope, fast = _slow_and_fast(covariance, 1.0 / fps)
+        self._precision = wider * np.linalg.inv(fast)
+        self._keep = _kept(1.0 / fps)
 
     def started(self, fits: Sequence[FrameFit]) -> list[FrameFit]:
-        """Return the fits, with d estimated from skin in frames in which an arch was not found."""
+        """Return the fits, with d estimated from skin if the face is familiar and an arch was not found."""
         return [
-            replace(fit, pose=replace(fit.pose, d=d)) if used and not fit.found.all() else fit
-            for fit, d, used in zip(fits, self._d, self.used, strict=True)
+            replace(fit, pose=replace(fit.pose, d=d)) if familiar and not fit.found.all() else fit
+            for fit, d, familiar in zip(fits, self._d, self.familiar, strict=True)
         ]
 
     def add(self, system: TakeSystem, d: Array, slow: Array, first: int) -> None:
@@ -98,6 +99,60 @@ class SkinFactor:
         weight = np.full(count, (1 - keep) ** 2 / (1 - keep**2))
         weight[[0, -1]] = (1 - keep) / (1 - keep**2)
         return self._wider * weight
+
+
+class SkinFilter:
+    """The same measurements one frame at a time, for live tracking: a Kalman filter of the slow error."""
+
+    def __init__(self) -> None:
+        """Start with an unknown slow error."""
+        self._slow, self._covariance = np.zeros(SLOW), np.eye(SLOW)
+
+    def fuse(
+        self, skin: SkinJaw, d: Array, covariance: Array, *, seen: bool, seconds: float
+    ) -> tuple[Array, Array, bool]:
+        """Combine d of a frame with that of its skin.
+
+        Args:
+            skin: jaw of the skin in the frame; d of shape (3,).
+            d: jaw parameters without the skin [mm], shape (3,): measured or predicted.
+            covariance: their covariance [mm^2], shape (3, 3).
+            seen: whether d was measured from both arches. Only then is the slow error corrected, since a predicted d
+                repeats the errors of earlier frames.
+            seconds: time since the previous frame [s].
+
+        Returns:
+            d and its covariance, and whether the skin was used, which it is if the face is known.
+        """
+        keep = _kept(seconds)
+        self._slow = keep * self._slow
+        self._covariance = keep**2 * self._covariance + (1 - keep**2) * np.eye(SLOW)
+        if not np.isfinite(skin.d).all():
+            return d, covariance, False
+        slope, fast = _slow_and_fast(skin.covariance, seconds)
+        residual = skin.d - d - slope @ self._slow
+        by_slow = self._covariance @ slope.T
+        precision = np.linalg.inv(covariance + slope @ by_slow + fast)
+        if seen:
+            self._slow = self._slow + by_slow @ precision @ residual
+            self._covariance = self._covariance - by_slow @ precision @ by_slow.T
+        gain = covariance @ precision
+        return d + gain @ residual, covariance - gain @ covariance, True
+
+
+def _slow_and_fast(covariance: Array, seconds: float) -> tuple[Array, Array]:
+    """Split covariances of the skin (..., 3, 3) in frames `seconds` apart.
+
+    Returns:
+        The change of d [mm] with the slow error, and the covariance of the fast error [mm^2], shape (..., 3, 3) each.
+    """
+    slope = np.sqrt(_SHARE) * np.linalg.cholesky(covariance)
+    return slope, (1 - _SHARE) * max(1.0, _FAST_S / seconds) * covariance
+
+
+def _kept(seconds: float) -> float:
+    """Return the correlation of the slow error over a time [s]."""
+    return float(np.exp(-seconds / _SLOW_S))
 
 
 def jaw_of_skin(skin: SkinOf | None, frames: Sequence[int], fits: Sequence[FrameFit]) -> SkinJaw | None:

@@ -177,7 +177,7 @@ class Smoother:
         system.add_shared(*unknowns.prior(state))
         # In gaps, first differences are penalised as well, so that the jaw does not drift at constant velocity.
         unseen = np.array([not fit.found.all() for fit in fits])
-        unknown = unseen & ~self._by_skin(len(fits))
+        unknown = unseen if self._skin is None else unseen & ~self._skin.familiar
         gap, jaw_gap = ((one[1:] | one[:-1])[:, None] for one in (unseen, unknown))
         poses = [fit.pose for fit in fits]
         d = np.stack([pose.d for pose in poses])

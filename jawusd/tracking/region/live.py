@@ -78,14 +78,28 @@ class LiveTake:
             raise ValueError("`step` was called before `begin`")
         return self._tracker.step(cut, frames)
 
-    def sigma_d(self, fit: FrameFit) -> Array:
-        """Return the standard deviations of the jaw parameters d in the last step [mm], including the rig error (3,).
+    def carry(self, d: Array, covariance: Array) -> None:
+        """Replace d of a frame with hidden teeth, from which the next step starts.
+
+        Args:
+            d: jaw parameters [mm], shape (3,).
+            covariance: their covariance [mm^2], shape (3, 3).
 
         Raises:
             ValueError: `begin` was not called.
         """
         if self._tracker is None:
-            raise ValueError("the standard deviations were requested before `begin` was called")
+            raise ValueError("`carry` was called before `begin`")
+        self._tracker.carry(d, np.diag(covariance) / _WIDER**2)
+
+    def covariance_d(self, fit: FrameFit) -> Array:
+        """Return the covariance of the jaw parameters d in the last step [mm^2], including the rig error (3, 3).
+
+        Raises:
+            ValueError: `begin` was not called.
+        """
+        if self._tracker is None:
+            raise ValueError("the covariance was requested before `begin` was called")
         precision, of_rig = np.diag(self._tracker.expected.precision), np.zeros((3, 3))
         if fit.solution is not None and fit.found.any():
             weight = np.where(fit.found, 1.0 / (residual_px(fit.solution) ** 2 * CORRELATION_PX), 0.0)
@@ -93,5 +107,4 @@ class LiveTake:
             lower = weight[1] * fit.solution.outline.precision[1].sum(0)
             gain = rig_gain(self.coordinates, fit.pose, precision, lower)
             of_rig = gain @ self.coordinates.jaw.pose_covariance(fit.pose.d) @ gain.T
-        variance_mm2 = _WIDER**2 * np.diag(np.linalg.inv(precision))[JAW]
-        return np.asarray(np.sqrt(variance_mm2 + np.diag(of_rig)), np.float64)
+        return np.asarray(_WIDER**2 * np.linalg.inv(precision)[JAW, JAW] + of_rig, np.float64)

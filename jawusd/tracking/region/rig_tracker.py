@@ -129,6 +129,10 @@ class RigTracker:
         fit = look.fit(found, trusted, self._free_focal)
         return replace(fit, uncertain=bool((share < THOROUGH.uncertain * usual).any()))
 
+    def carry(self, d: Array, variance_mm2: Array) -> None:
+        """Predict the next frame from d of elsewhere; see `Prediction.carry`."""
+        self._motion.carry(d, variance_mm2)
+
     def _remember(self, share: Array) -> None:
         """Add the matched fractions of both arches (2,) to the statistics, except uncertain ones."""
         usual = self._usual_share()
