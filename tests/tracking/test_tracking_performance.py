@@ -75,7 +75,7 @@ def write_masks(out, jaw, truth, cameras, grown_px=(0.0, 0.0), hidden=HIDDEN):
     return out
 
 
-def solved(jaw, scans, truth, folder, cameras, off_mm=1.0, **options):
+def solved(jaw, scans, truth, folder, cameras, off_mm=1.0, seed=4, **options):
     """Solve the take with some cameras from a disturbed start."""
     d, head = truth
     names = [camera.name for camera in cameras]
@@ -83,7 +83,7 @@ def solved(jaw, scans, truth, folder, cameras, off_mm=1.0, **options):
         folder, COUNT, cameras=[small_take.source(folder, n) for n in names], bootstrap=None
     )
     start = np.stack([head[0], head[0] @ jaw.pose(d[0])])
-    start = disturbed(start, off_mm, 0.01, np.random.default_rng(4))
+    start = disturbed(start, off_mm, 0.01, np.random.default_rng(seed))
     table = {camera.name: camera for camera in cameras}
     with MaskViews(capture.cameras, table, small_take.OFFSETS, teeth_centre(scans, start), 7.2, 1) as views:
         frames = (small_take.FIRST, small_take.FIRST + COUNT)
@@ -223,6 +223,16 @@ def test_residuals_are_looked_at_again_after_long_steps(jaw, scans, truth, monke
 def test_a_start_elsewhere_is_refused(jaw, scans, truth, folder):
     with pytest.raises(TrackingError, match="do not fit the masks"):
         solved(jaw, scans, truth, folder, small_take.CAMERAS, off_mm=25.0)
+
+
+@pytest.mark.parametrize("seed", [2, 7, 11])
+def test_a_wrong_start_is_refused_and_never_followed(jaw, scans, truth, folder, seed):
+    try:
+        found = solved(jaw, scans, truth, folder, small_take.CAMERAS[:1], off_mm=5.0, seed=seed)
+    except TrackingError as error:
+        assert "do not fit the masks" in str(error)
+    else:
+        assert tip_error_mm(jaw, found, truth)[seen()].max() < 1.5
 
 
 def test_relative_poses_are_the_rigs(jaw, scans, truth):

@@ -19,9 +19,9 @@ from jawusd.tracking.contour.solver import ContourSolver
 from jawusd.tracking.contour.views import FEWEST_MASKS, View, present_masks
 from jawusd.tracking.initialization.magnification import magnified, measure_magnification
 
-# Minimum `arch_fit` of a first frame [-]: wrong poses stay below it; correct poses exceed it, even with most lower
-# teeth hidden.
-_LEAST_FIT = 0.03
+#: Minimum `arch_fit` of a first frame [-]: wrong poses stay below it; correct poses exceed it, even with most lower
+#: teeth hidden.
+LEAST_FIT = 0.03
 # Minimum `arch_fit` [-] of a first frame that fits only without one of the cameras: an unambiguous fit, as in
 # `start_causes.CLEAR_FIT`.
 _CLEAR_FIT = 0.3
@@ -109,12 +109,12 @@ def _problem(first: _Aligned, config: TrackingConfig) -> str | None:
     for r in ARCHES:
         share = score_px(first.solution)[r].sum() / max(first.solution.visible_px[r].sum(), 1.0)
         uncovered = np.nanmedian(first.coverage[r, first.use[r]])
-        if share < config.first_share or uncovered > config.lost_coverage or first.fit[r] < _LEAST_FIT:
+        if share < config.first_share or uncovered > config.lost_coverage or first.fit[r] < LEAST_FIT:
             return (
                 f"the {ARCH_NAMES[r]} teeth do not fit their masks: {share:.0%} of the visible contour "
                 f"matches (at least {config.first_share:.0%} is needed), {uncovered:.1%} of the masks is not covered "
                 f"(at most {config.lost_coverage:.0%} is allowed), and the match minus the penalty for uncovered mask "
-                f"is {first.fit[r]:.3f} (at least {_LEAST_FIT} is needed)"
+                f"is {first.fit[r]:.3f} (at least {LEAST_FIT} is needed)"
             )
     return None
 

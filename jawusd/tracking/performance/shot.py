@@ -17,10 +17,12 @@ from jawusd.formats.mesh import Mesh
 from jawusd.formats.performance import Performance
 from jawusd.geometry import Camera, transform_points
 from jawusd.tracking.config import Mapper, TrackingConfig
+from jawusd.tracking.contour.quality import arch_fit
 from jawusd.tracking.contour.scan import Scan, prepare_scan, teeth_centre
 from jawusd.tracking.contour.solver import ContourSolver
-from jawusd.tracking.contour.views import MaskViews, masked_sources
+from jawusd.tracking.contour.views import MaskViews, View, masked_sources
 from jawusd.tracking.follow import Begin, TwoWays
+from jawusd.tracking.initialization.first_frame import LEAST_FIT
 from jawusd.tracking.initialization.footage import Footage
 from jawusd.tracking.initialization.scan_checks import check_occlusion
 from jawusd.tracking.initialization.start import find_start
@@ -106,7 +108,7 @@ class _Take:
         self._jaw, self._config, self._shot, self._progress = jaw, solver.config, shot, progress
         self.coordinates = Coordinates(jaw, solver.scans)
         self._quick, self._full = (InstantSolver(one, self.coordinates) for one in (quick(solver), whole(solver)))
-        self._views, self._probes = KeptViews(shot.views), solver.scans[1].probes
+        self._views, self._scans = KeptViews(shot.views), solver.scans
         self._weight = np.full(2, 1.0 / self._config.typical_noise_px3)
         self.fits: MutableMapping[int, FrameFit] = {}
 
@@ -115,8 +117,9 @@ class _Take:
         first, stop = self._shot.frames
         start = self._shot.start_frame
         attempts = Attempts(self._quick, self._weight)
-        begun = attempts.near(self._shot.start, attempts.instant(self._views.at(start)))
-        if not begun.found.all():
+        views = self._views.at(start)
+        begun = attempts.near(self._shot.start, attempts.instant(views))
+        if not begun.found.all() or self._fit(begun, views).min() < LEAST_FIT:
             raise TrackingError(
                 "the teeth, posed by the rig, do not fit the masks of the start frame",
                 frame=start,
@@ -125,6 +128,12 @@ class _Take:
         take = TwoWays(range(first, stop), self._places, lambda fit: fit.objective_px, progress=self._progress)
         self.fits = take.known
         take.follow(Begin(start, begun, self._walk))
+
+    def _fit(self, found: FrameFit, views: Sequence[View]) -> Array:
+        """Return the matched fraction of each arch's contour less the penalty for uncovered mask, shape (2,) [-]."""
+        if found.solution is None:
+            return np.full(2, -np.inf)
+        return arch_fit(self._scans, found.solution, views, self._config.uncovered_price)
 
     def _walk(self, way: range, near: FrameFit) -> Iterator[FrameFit]:
         """Yield the fits of frames in tracking order, starting next to a given fit.
@@ -138,7 +147,7 @@ class _Take:
             yield passing.step(self._views.at(frame))
 
     def _places(self, fit: FrameFit) -> Array:
-        return transform_points(self._jaw.pose(fit.pose.d), self._probes)
+        return transform_points(self._jaw.pose(fit.pose.d), self._scans[1].probes)
 
     def second_pass(self) -> Smoothed:
         """Refine all frames jointly."""

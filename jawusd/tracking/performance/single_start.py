@@ -41,10 +41,11 @@ from jawusd.tracking.performance.instant import Expected, InstantSolver
 _PX_PER_MM = 2.0
 # assumed distance of the teeth along the optical axis, which determines the resolution of the views
 _ANYWHERE_MM = 200.0
-_SURVEYED, _FRAMES_TRIED = 24, 4  # number of frames surveyed for large masks, and maximum number of frames searched
+# Number of frames surveyed for large masks; numbers of frames searched if a start is accepted, and otherwise.
+_SURVEYED, _FRAMES_TRIED, _MOST_TRIED = 24, 4, 10
 # Candidate widths of the visible teeth [mm], from the front teeth to a whole arch, each an eighth larger than the one
 # before.
-_WIDTHS_MM = 22.0 * 1.125 ** np.arange(10)
+_WIDTHS_MM = 22.0 * 1.125 ** np.arange(12)
 _USUAL_WIDTH_MM = 42.0
 _GRID = Grid(
     yaw_rad=np.radians(np.arange(-56, 57, 8.0)),
@@ -110,12 +111,12 @@ class SingleStart:
             CaptureError: a mask cannot be read.
         """
         best: FoundPose | None = None
-        frames = footage.survey(None, _SURVEYED).promising(_FRAMES_TRIED).tolist()
-        for frame in frames:
+        frames = footage.survey(None, _SURVEYED).promising(_MOST_TRIED).tolist()
+        for tried, frame in enumerate(frames, 1):
             found = self.at(footage, frame)
             if found is not None and (best is None or found.fit > best.fit):
                 best = found
-            if best is not None and best.fit >= _CLEAR_FIT:
+            if best is not None and best.fit >= (_CLEAR_FIT if tried < _FRAMES_TRIED else _LEAST_FIT):
                 break
         if best is None or best.fit < _LEAST_FIT:
             raise TrackingError(
