@@ -26,7 +26,7 @@ FILES = {
         "Faces: CSV of columns or points": "jawusd.formats.face_table",
         "Face models: correspondences, and alignment: JSON": "jawusd.formats.alignment",
         "Face models: jaw motion in npz": "jawusd.formats.face_track",
-        "ARKit face captures: CSV, and mappings: JSON": "jawusd.formats.arkit",
+        "ARKit face captures: CSV": "jawusd.formats.arkit",
     },
     "What comes out": {
         "Tracks: tracks.npz": "jawusd.formats.tracks",

@@ -1,4 +1,4 @@
-"""Commands that write an animation layer, and fit or tabulate mappings of ARKit weights."""
+"""Commands that write an animation layer, or tabulate ARKit shapes."""
 
 from __future__ import annotations
 
@@ -12,10 +12,8 @@ from jawusd.cli.output import emit
 from jawusd.formats.atomic import refuse_existing
 
 if TYPE_CHECKING:
-    from jawusd.base.arrays import Array
     from jawusd.cli.motion import AuthoredMotion, Changes
     from jawusd.evaluator import JawRig
-    from jawusd.formats.arkit import ArkitMapping, BlendShapes
 
 
 Rate = Annotated[
@@ -124,7 +122,7 @@ def animate(
     mapping: Annotated[
         Path | None,
         typer.Option(
-            help="Mapping of the actor's ARKit weights to d, from arkit-fit or skin-fit. "
+            help="The actor's map from ARKit weights to d, written by arkit-fit or skin-fit. "
             "Default: fractions of the ranges.",
             show_default=False,
         ),
@@ -170,72 +168,14 @@ def animate(
 _CLAMPED_MM = 0.005  # minimum distance for a frame to be listed; smaller distances would be printed as 0.00
 
 
-def arkit_fit(
-    rig: RigArg,
-    face: Annotated[Path, typer.Argument(help="ARKit face capture, the CSV of Live Link Face.", show_default=False)],
-    jaw: Annotated[
-        Path,
-        typer.Argument(
-            help="The jaw of the same performance: tracks.npz, d.csv, or a table of poses.", show_default=False
-        ),
-    ],
-    out: Annotated[Path, typer.Option("-o", "--out", help="Mapping to write (JSON).")] = Path("arkit.json"),
-    fps: Annotated[
-        float | None,
-        typer.Option(min=0.001, help="Frames per second of the face capture. Default: from its time codes."),
-    ] = None,
-    jaw_fps: Annotated[
-        float | None,
-        typer.Option(min=0.001, help="Frames per second of the jaw. Default: that of the tracks or the rig."),
-    ] = None,
-    offset: Annotated[
-        float | None,
-        typer.Option(
-            help="Time from frame 0 of the jaw to the first row of the face [s]. Default: estimated from the opening."
-        ),
-    ] = None,
-    force: Force = False,
-    prim: Prim = None,
-    allow: Allow = None,
-    as_json: Json = False,
-) -> None:
-    """Fit the mapping from a subject's ARKit jaw weights to d, for `animate`; face and jaw must be captured together.
-
-    In the take, the subject must open the jaw wide, and move it to both sides and forward.
-    """
-    import jawusd
-    from jawusd.fitting.face import fit_arkit
-    from jawusd.formats.arkit import read_arkit, save_mapping
-
-    refuse_existing(out, force)
-    loaded = jawusd.load(rig, prim=prim)
-    times_s, d = _jaw_of_take(loaded, rig, jaw, jaw_fps, prim)
-    found = fit_arkit(loaded, read_arkit(face, fps), times_s, d, offset)
-    save_mapping(out, found.mapping)
-    result = {
-        "file": str(out),
-        "frames": found.frames,
-        "offset_s": found.offset_s,
-        "error_mm": found.error_mm,
-        "shares_error_mm": found.shares_error_mm,
-    }
-    emit(
-        result,
-        as_json,
-        lambda: [
-            f"{out}: from {found.frames} frames, the face starts {found.offset_s:.3f} s after the jaw's frame 0",
-            f"held-out error at the incisal point {found.error_mm:.2f} mm; "
-            f"by fractions of the ranges {found.shares_error_mm:.2f} mm",
-        ],
-    )
-
-
 def arkit_table(
     rig: RigArg,
     out: Annotated[Path, typer.Option("-o", "--out", help="Table to write (CSV).")] = Path("joint.csv"),
     mapping: Annotated[
         Path | None,
-        typer.Option(help="The actor's mapping, from arkit-fit. Default: fractions of the ranges.", show_default=False),
+        typer.Option(
+            help="The actor's map, written by arkit-fit. Default: fractions of the ranges.", show_default=False
+        ),
     ] = None,
     force: Force = False,
     prim: Prim = None,
@@ -250,33 +190,16 @@ def arkit_table(
     import jawusd
     from jawusd.formats.poses import save_joint_table
     from jawusd.pipeline.bake import joint_deltas
+    from jawusd.pipeline.skin import load_own_skin
 
     refuse_existing(out, force)
     loaded = jawusd.load(rig, prim=prim)
-    rows = joint_deltas(loaded, None if mapping is None else _own_mapping(loaded, mapping))
+    rows = joint_deltas(loaded, None if mapping is None else load_own_skin(loaded, mapping))
     save_joint_table(out, rows)
     clamped = [row for row in rows if row.clamped_mm > _CLAMPED_MM]
     lines = [f"{out}: {len(rows)} rows"]
     lines += [f"{row.shape} {row.weight:g} lay {row.clamped_mm:.2f} mm outside the bound" for row in clamped]
     emit({"file": str(out), "rows": len(rows), "clamped": len(clamped)}, as_json, lambda: lines)
-
-
-def _jaw_of_take(rig: JawRig, path: Path, source: Path, fps: float | None, prim: str | None) -> tuple[Array, Array]:
-    """Return times [s], shape (N,), and d [mm], shape (N, 3), of tracks or a table."""
-    import numpy as np
-
-    from jawusd.cli.motion import read_pose_table
-    from jawusd.formats.poses import read_poses_or_parameters
-    from jawusd.formats.tracks import load_tracks
-
-    if source.suffix != ".npz":
-        frames, d = read_poses_or_parameters(source)
-    else:
-        frames, d = read_pose_table(source)
-        fps = fps or load_tracks(source).meta.get("fps")
-    if d.ndim > 2:
-        d, _ = rig.encode(d)
-    return np.asarray(frames, dtype=np.float64) / (fps or rate_of(path, prim)), d
 
 
 def rate_of(rig: Path, prim: str | None) -> float:
@@ -296,7 +219,7 @@ def rate_of(rig: Path, prim: str | None) -> float:
 
 
 def read_face(rig: JawRig, source: Path, fps: float | None, mapping: Path | None) -> AuthoredMotion:
-    """Read the jaw motion of an ARKit face capture, by the subject's mapping or as fractions of the ranges of motion.
+    """Read the jaw motion of an ARKit face capture, by the subject's map or as fractions of the ranges of motion.
 
     Without a mapping, JawOpen = 1 is the full opening, and (JawLeft - JawRight) and JawForward are fractions of the
     ranges of motion at the current opening. Left is the subject's left.
@@ -304,7 +227,7 @@ def read_face(rig: JawRig, source: Path, fps: float | None, mapping: Path | None
     Args:
         source: CSV of Live Link Face.
         fps: frame rate of the motion [1/s]; None: the rate of the time codes.
-        mapping: file written by `jawusd arkit-fit`, or by `jawusd skin-fit` from the same blend shapes; None: use
+        mapping: file written by `jawusd arkit-fit`, or by `jawusd skin-fit` from blend shapes of this app; None: use
             fractions of the ranges of motion.
 
     Raises:
@@ -314,51 +237,15 @@ def read_face(rig: JawRig, source: Path, fps: float | None, mapping: Path | None
 
     from jawusd.base.errors import FormatError
     from jawusd.cli.motion import AuthoredMotion
-    from jawusd.formats.arkit import read_arkit, read_blend_shapes, shares_of
+    from jawusd.formats.arkit import read_arkit, shares_of
+    from jawusd.pipeline.skin import load_own_skin, own_columns, read_blend_face
 
-    if mapping is not None and mapping.suffix == ".npz":
-        shapes = read_blend_shapes(source, fps)
-        frames, rate, d = shapes.frames, shapes.fps, _by_skin(rig, shapes, source, mapping)
+    if mapping is not None:
+        face, skin = read_blend_face(source, fps), load_own_skin(rig, mapping)
+        frames, rate, d = face.frames, face.fps, skin(own_columns(skin, mapping, face, source)).d
     else:
         capture = read_arkit(source, fps)
-        frames, rate = capture.frames, capture.fps
-        own = None if mapping is None else _own_mapping(rig, mapping)
-        d = rig.denormalized(shares_of(capture.weights)) if own is None else own.d(capture.weights)
+        frames, rate, d = capture.frames, capture.fps, rig.denormalized(shares_of(capture.weights))
     if not np.isfinite(d).any():
         raise FormatError("no row has a face (BlendShapeCount is 0 in all rows).", path=source)
     return AuthoredMotion(frames, d, rate)
-
-
-def _by_skin(rig: JawRig, shapes: BlendShapes, source: Path, path: Path) -> Array:
-    """Return d [mm], shape (F, 3), estimated from all blend shapes of a face capture."""
-    from jawusd.base.errors import FormatError
-    from jawusd.evaluator.skin import load_skin
-
-    skin = load_skin(path)
-    _check_actor(rig, skin.actor, path)
-    if skin.meta.get("names") != list(shapes.names):
-        raise FormatError(
-            f"has {len(shapes.names)} blend shapes; {path.name} was learned from {skin.columns} columns, whose names "
-            "or order differ.",
-            path=source,
-        )
-    return skin(shapes.weights).d
-
-
-def _own_mapping(rig: JawRig, path: Path) -> ArkitMapping:
-    from jawusd.formats.arkit import load_mapping
-
-    own = load_mapping(path)
-    _check_actor(rig, own.actor, path)
-    return own
-
-
-def _check_actor(rig: JawRig, actor: str, path: Path) -> None:
-    from jawusd.base.errors import FormatError
-
-    if actor != rig.actor:
-        raise FormatError(
-            f'is the mapping of "{actor}", but the rig is of "{rig.actor}"; parameters differ between subjects.',
-            path=path,
-            hint="Omit --mapping, or animate that subject's rig and use `jawusd retarget`.",
-        )

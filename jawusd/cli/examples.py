@@ -40,8 +40,8 @@ EXAMPLES = {
         "face_tracker | jawusd live out shot --source left=/dev/video0 --skin skin.npz --face -",
     ),
     "rebake": ("jawusd rebake shot.usda -o jaws.usdc", "jawusd rebake out export.fbx -o anim_edited.usdc"),
-    "arkit-fit": ("jawusd arkit-fit out face.csv take.npz -o arkit.json",),
-    "arkit-table": ("jawusd arkit-table out --mapping arkit.json -o joint.csv",),
+    "arkit-fit": ("jawusd arkit-fit out face.csv take.npz -o arkit.npz",),
+    "arkit-table": ("jawusd arkit-table out --mapping arkit.npz -o joint.csv",),
     "align": ("jawusd align out points.json -o T_skull_model.json",),
     "skin-fit": (
         "jawusd skin-fit out take.npz face.csv -o skin.npz --bite 1200-1260",

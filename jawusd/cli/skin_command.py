@@ -1,4 +1,4 @@
-"""The command `skin-fit`, which learns jaw motion from facial skin."""
+"""The commands `skin-fit` and `arkit-fit`, which learn jaw motion from faces."""
 
 from __future__ import annotations
 
@@ -12,7 +12,10 @@ from jawusd.cli.output import emit
 from jawusd.formats.atomic import refuse_existing
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from jawusd.evaluator.skin import Skin
+    from jawusd.formats.face_table import FaceTable
 
 _GUESSES = {"chin": "a chin rigid with the bone", "mean": "the mean d", "carried": "the last d"}
 
@@ -97,22 +100,64 @@ def skin_fit(
     """
     import math
 
-    import jawusd
-    from jawusd.cli.animate_commands import rate_of
     from jawusd.cli.options import rigid_bodies
-    from jawusd.pipeline.skin import learn_skin, read_face, read_jaw
+    from jawusd.pipeline.skin import read_face
 
     refuse_existing(out, force)
     bites = [_frames(text) for text in bite or ()]
+    seen = read_face(face, fps, length_unit.value, rigid_bodies(rigid), rest_frame)
+    error = (head_error[0], math.radians(head_error[1]))
+    _learn(rig, take, seen, out, jaw_fps, offset, prim, as_json, bites, error)
+
+
+def arkit_fit(
+    rig: RigArg,
+    face: Annotated[Path, typer.Argument(help="ARKit face capture, the CSV of Live Link Face.", show_default=False)],
+    take: TakeArg,
+    out: Out = Path("arkit.npz"),
+    fps: Fps = None,
+    jaw_fps: JawFps = None,
+    offset: Offset = None,
+    force: Force = False,
+    prim: Prim = None,
+    allow: Allow = None,
+    as_json: Json = False,
+) -> None:
+    """Learn d from the four ARKit jaw weights, as skin-fit does from all blend shapes, for `animate` and `arkit-table`.
+
+    Face and jaw must be captured together. The subject must open the jaw wide, and move it to both sides and forward.
+    """
+    from jawusd.pipeline.skin import read_jaw_weights
+
+    refuse_existing(out, force)
+    _learn(rig, take, read_jaw_weights(face, fps), out, jaw_fps, offset, prim, as_json)
+
+
+def _learn(
+    rig: Path,
+    take: Path,
+    face: FaceTable,
+    out: Path,
+    jaw_fps: float | None,
+    offset: float | None,
+    prim: str | None,
+    as_json: bool,
+    bites: Sequence[tuple[int, int]] = (),
+    head_error: tuple[float, float] = (0.0, 0.0),
+) -> None:
+    """Learn d from a face, and write and print the result."""
+    import jawusd
+    from jawusd.cli.animate_commands import rate_of
+    from jawusd.pipeline.skin import learn_skin, read_jaw
+
     loaded = jawusd.load(rig, prim=prim)
     jaw = read_jaw(loaded, take)
     jaw = jaw.at_rate(jaw_fps or jaw.fps or rate_of(rig, prim))
     for first, last in bites:
         jaw = jaw.with_bite(first, last)
-    seen = read_face(face, fps, length_unit.value, rigid_bodies(rigid), rest_frame)
-    if seen.fps is None:
+    if face.fps is None:
         raise typer.BadParameter("is needed: the face capture does not state a frame rate.", param_hint="--fps")
-    skin, offset_s = learn_skin(loaded, jaw, seen, offset, (head_error[0], math.radians(head_error[1])))
+    skin, offset_s = learn_skin(loaded, jaw, face, offset, head_error)
     jawusd.save_skin(out, skin)
     emit({"file": str(out), "offset_s": offset_s, **skin.meta}, as_json, lambda: _lines(out, skin, offset_s))
 

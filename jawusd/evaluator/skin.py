@@ -129,6 +129,12 @@ class Skin:
         return {str(name): float(value) for name, value in named if isinstance(value, int | float)}
 
     @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the columns or points; empty if unknown."""
+        found = self.meta.get("names")
+        return tuple(map(str, found)) if isinstance(found, list | tuple) else ()
+
+    @property
     def actor(self) -> str:
         """The subject's name, empty if unknown."""
         return str(self.meta.get("actor") or "")

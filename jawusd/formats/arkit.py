@@ -1,4 +1,4 @@
-"""Face captures of ARKit, as exported by Live Link Face, and a subject's mapping from weights to jaw parameters d.
+"""Face captures of ARKit, as exported by Live Link Face.
 
 A capture is a CSV table of blend shape weights with time codes:
 
@@ -11,29 +11,22 @@ and 59.94 frames per second, time codes may skip the first two or four frame num
 multiple of ten ("drop frame", SMPTE ST 12-1), marked by a semicolon before the frames or by the skipped numbers
 themselves. Column names are case-insensitive; other columns are ignored. In a row whose BlendShapeCount is 0, no face
 was detected.
-
-The mapping is a JSON file, format jawusd-arkit/1.
 """
 
 from __future__ import annotations
 
-import json
 import math
 import os
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
 
 from jawusd.base.arrays import Array
 from jawusd.base.errors import FormatError
-from jawusd.base.tables import TextTable, check_width, read_table, read_text
-from jawusd.formats.atomic import write_text_atomic
-from jawusd.formats.text import parse_model
+from jawusd.base.tables import TextTable, check_width, read_table
 
 _OTHER = re.compile(r"(head|lefteye|righteye)(yaw|pitch|roll)")  # columns of rotations, which are not blend shapes
 JAW_COLUMNS = ("jawopen", "jawleft", "jawright", "jawforward")
@@ -50,10 +43,6 @@ _MOST_STEPS_OFF = 2.0  # maximum difference between steps across seconds and wit
 # standardised weights lie far outside.
 _LEAST_WEIGHT, _MOST_WEIGHT, _PERCENT = -0.5, 2.0, 10.0
 _MAX_BYTES = 1 << 30
-_MAX_MAPPING_BYTES = 1 << 20
-_WITHIN = "numbers within +-10000"
-_Number = Annotated[float, Field(allow_inf_nan=False, ge=-1e4, le=1e4)]
-_Weights = tuple[_Number, _Number, _Number, _Number]
 
 
 @dataclass(frozen=True, eq=False)
@@ -290,58 +279,3 @@ def _frames(
             f"{table.named(row, column)} is not later than the row before; time codes must increase.", path=table.path
         )
     return frames - frames[0]
-
-
-class ArkitMapping(BaseModel):
-    """Mapping of one subject from jaw weights to jaw parameters d.
-
-    The order of weights is JawOpen, JawLeft, JawRight, JawForward.
-    d = rest_mm + (gain_mm + u_open * opened_gain_mm) @ u, where u is the deviation of each weight from its neutral
-    value, reduced by the dead zone (0 inside the zone), and u_open is the deviation of JawOpen. Gains of weights for
-    other directions model cross-talk; opened gains model how lateral and forward reach change as the jaw opens.
-    """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    format: Literal["jawusd-arkit/1"] = Field("jawusd-arkit/1", description='"jawusd-arkit/1"')
-    actor: str = Field(description="the actor's name")
-    neutral: _Weights = Field(description=f"four {_WITHIN}")
-    dead_zone: tuple[Annotated[_Number, Field(ge=0)], ...] = Field(
-        min_length=4, max_length=4, description=f"four {_WITHIN}, none below 0"
-    )
-    rest_mm: tuple[_Number, _Number, _Number] = Field(description=f"three {_WITHIN} [mm]")
-    gain_mm: tuple[_Weights, _Weights, _Weights] = Field(description=f"three rows of four {_WITHIN} [mm]")
-    opened_gain_mm: tuple[_Weights, _Weights, _Weights] = Field(description=f"three rows of four {_WITHIN} [mm]")
-
-    def d(self, weights: Array) -> Array:
-        """Convert weights (..., 4) to jaw parameters d [mm], shape (..., 3); NaN gives NaN."""
-        gains = np.concatenate([self.gain_mm, self.opened_gain_mm], axis=1)
-        moved = moved_terms(weights, np.array(self.neutral), np.array(self.dead_zone))
-        return np.array(self.rest_mm) + moved @ gains.T
-
-
-def moved_terms(weights: Array, neutral: Array, dead_zone: Array) -> Array:
-    """Return u and u_open * u (see `ArkitMapping`) of weights (..., 4), shape (..., 8)."""
-    change = weights - neutral
-    u = np.sign(change) * np.maximum(np.abs(change) - dead_zone, 0.0)
-    return np.concatenate([u, u[..., :1] * u], axis=-1)
-
-
-def load_mapping(path: str | os.PathLike[str]) -> ArkitMapping:
-    """Read an ARKit mapping.
-
-    Raises:
-        FormatError: the file is not an ARKit mapping; the message names the wrong entry.
-    """
-    path = Path(path)
-    hint = "Such a file is written by `jawusd arkit-fit`."
-    return parse_model(read_text(path, _MAX_MAPPING_BYTES), path, ArkitMapping, hint)
-
-
-def save_mapping(path: str | os.PathLike[str], mapping: ArkitMapping) -> None:
-    """Write an ARKit mapping atomically.
-
-    Raises:
-        OutputError: the file cannot be written.
-    """
-    write_text_atomic(path, json.dumps(mapping.model_dump(mode="json"), indent=1) + "\n")

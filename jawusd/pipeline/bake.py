@@ -6,9 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
-from jawusd.base.errors import RigError, explain_missing_packages
+from jawusd.base.arrays import Array
+from jawusd.base.errors import FittingError, RigError, explain_missing_packages
 from jawusd.evaluator import JawRig
-from jawusd.formats.arkit import ArkitMapping, shares_of
+from jawusd.evaluator.skin import Skin
+from jawusd.formats.arkit import JAW_COLUMNS, shares_of
 from jawusd.formats.capture import Capture
 from jawusd.formats.model import JawModel
 from jawusd.formats.poses import JointDelta
@@ -118,26 +120,30 @@ def write_take(capture: Capture, tracks: Tracks, folder: Path) -> list[Path]:
 
 
 SHAPES = ("JawOpen", "JawLeft", "JawRight", "JawForward")
+_REST_SHARE = 0.1  # fraction of the training frames, nearest to the closed bite, whose median is the face at rest
 _WEIGHTS = (0.5, 1.0)  # shape weights in the table: two, because the joint does not move linearly with the weight
 
 
-def joint_deltas(rig: JawRig, mapping: ArkitMapping | None = None) -> list[JointDelta]:
+def joint_deltas(rig: JawRig, skin: Skin | None = None) -> list[JointDelta]:
     """Return the offset of the jaw joint, midway between the condyles, for each ARKit shape at half and full weight.
 
-    The weights of all other shapes are zero. The jaw parameters d are projected into the bound, as by `jawusd animate`.
+    All other shapes are at rest. The jaw parameters d are projected into the bound, as by `jawusd animate`.
 
     Args:
-        mapping: the subject's mapping from ARKit weights to d; None: weights are fractions of the ranges of motion, and
-            the teeth are closed in the neutral face.
+        skin: the subject's map from ARKit weights to d, whose face at rest is neutral; None: weights are fractions of
+            the ranges of motion, and the teeth are closed in the neutral face.
+
+    Raises:
+        FittingError: the map was not learned from the four jaw weights.
     """
     from jawusd.rig.skel import joint_poses
 
-    neutral = np.zeros(4) if mapping is None else np.array(mapping.neutral)
+    neutral, places = (np.zeros(4), range(4)) if skin is None else _face_at_rest(skin)
     cases = [(i, weight) for i in range(len(SHAPES)) for weight in _WEIGHTS]
     weights = np.tile(neutral, (1 + len(cases), 1))
     for row, (i, weight) in enumerate(cases, start=1):
-        weights[row, i] = weight
-    wanted = rig.denormalized(shares_of(weights)) if mapping is None else mapping.d(weights)
+        weights[row, places[i]] = weight
+    wanted = rig.denormalized(shares_of(weights)) if skin is None else skin(weights).d
     d = rig.project(wanted)
     joint = joint_poses(rig, d)
     moved, turned = joint[1:, :3, 3] - joint[0, :3, 3], joint[1:, :3, :3] @ joint[0, :3, :3].T
@@ -146,3 +152,21 @@ def joint_deltas(rig: JawRig, mapping: ArkitMapping | None = None) -> list[Joint
         JointDelta(SHAPES[i], weight, *rest)
         for (i, weight), *rest in zip(cases, d[1:], moved, turned, clamped.tolist(), strict=True)
     ]
+
+
+def _face_at_rest(skin: Skin) -> tuple[Array, list[int]]:
+    """Return the median columns (K,) of the training frames nearest to the closed bite, and where the jaw weights are.
+
+    Raises:
+        FittingError: a jaw weight is not among the columns.
+    """
+    names = [name.lower() for name in skin.names]
+    if missing := [shape for shape, column in zip(SHAPES, JAW_COLUMNS, strict=True) if column not in names]:
+        raise FittingError(
+            f"the map was not learned from {', '.join(missing)}; the table needs the four jaw weights of ARKit.",
+            hint="Learn it with `jawusd arkit-fit`.",
+        )
+    arrays = skin.arrays
+    near = np.argsort(np.linalg.norm(arrays["d"], axis=1))[: max(int(_REST_SHARE * len(arrays["d"])), 1)]
+    rest = arrays["mean"] + arrays["scale"] * np.median(arrays["features"][near], axis=0) @ arrays["basis"]
+    return rest, [names.index(column) for column in JAW_COLUMNS]

@@ -21,8 +21,8 @@ from jawusd.formats.performance import SolveState
 from jawusd.media import live_clock
 from jawusd.pipeline.live_frame import LiveJaw
 from jawusd.pipeline.markers import LENGTH_UNITS_MM
-from jawusd.pipeline.skin import load_own_skin, read_face
-from jawusd.pipeline.solve_skin import check_agreement, check_columns
+from jawusd.pipeline.skin import load_own_skin, own_columns, read_face
+from jawusd.pipeline.solve_skin import check_agreement
 from jawusd.pipeline.solve_videos import SkinOptions
 from jawusd.tracking.performance.skin import SkinFilter
 
@@ -101,10 +101,11 @@ class RecordedFace:
             FormatError: it is invalid, or has other columns than those of the map or no frame rate.
         """
         face = read_face(options.face, options.fps, options.unit, options.rigid, options.rest_frame)
-        check_columns(skin, face, options)
+        columns = own_columns(skin, options.skin, face, options.face)
         if not face.fps:
             raise FormatError("does not state its frame rate.", path=options.face, hint="Give it with --face-fps.")
-        self._times_s, self._rows = face.frames / face.fps + (options.offset_s or 0.0), face.X.reshape(len(face.X), -1)
+        self._times_s = face.frames / face.fps + (options.offset_s or 0.0)
+        self._rows = columns.reshape(len(columns), -1)
         self._begin_s = 0.0
 
     def play(self, begin_s: float, silence_s: float) -> None:
@@ -205,13 +206,12 @@ class FaceStream:
     def _take(self, face: FaceTable, number: int) -> None:
         """Keep a row."""
         arrived_s, options = live_clock.now_s(), self._options
-        if not self._rows:
-            check_columns(self._skin, face, options)
+        found = own_columns(self._skin, options.skin, face, options.face)
         fps = face.fps or options.fps
         if not fps:
             raise FormatError("has no column time_s.", path=options.face, hint="Give its frame rate with --face-fps.")
-        row_s, columns = float(face.frames[0]) / fps, face.X.reshape(-1)
-        if face.X.ndim == 3:
+        row_s, columns = float(face.frames[0]) / fps, found.reshape(-1)
+        if self._skin.points:
             columns = columns * LENGTH_UNITS_MM[options.unit]
         if self._rows and row_s <= self._rows[-1][0]:
             raise FormatError(f"line {number} is not later than the row before.", path=options.face)

@@ -16,7 +16,7 @@ from jawusd.evaluator import JawRig
 from jawusd.evaluator.skin import Skin, load_skin
 from jawusd.fitting.face import columns_at
 from jawusd.fitting.skin import HEAD_ERROR, clock_offset, fit_skin
-from jawusd.formats.arkit import read_blend_shapes
+from jawusd.formats.arkit import JAW_COLUMNS, read_arkit, read_blend_shapes
 from jawusd.formats.face_table import FaceTable, header_of, is_face_table, read_face_table
 from jawusd.formats.markers import read_markers
 from jawusd.formats.performance import SolveState
@@ -25,6 +25,7 @@ from jawusd.formats.tracks import Tracks, load_tracks
 from jawusd.pipeline.markers import LENGTH_UNITS_MM, in_head, read_c3d
 
 SIGMA_MM = 0.15  # standard deviation of d, if the file does not state it
+_LISTED = 8  # number of missing columns that a message names
 _LARGEST_SIGMA_MM = 1.0  # standard deviation at the incisal point above which a pose does not count as seen
 
 
@@ -127,6 +128,35 @@ def load_own_skin(rig: JawRig, path: str | os.PathLike[str]) -> Skin:
     return skin
 
 
+def own_columns(skin: Skin, map_path: str | os.PathLike[str], face: FaceTable, path: str | os.PathLike[str]) -> Array:
+    """Return the columns (F, K) or points (F, N, 3) from which a map was learned, found in face data by name.
+
+    Args:
+        skin: the map.
+        map_path: its file, for messages.
+        face: face data, which may have more columns or points.
+        path: their file, for messages.
+
+    Raises:
+        FormatError: a column or point is missing, or the data have points and the map columns, or conversely.
+    """
+    place = {name.lower(): k for k, name in enumerate(face.names)}
+    names = [name.lower() for name in skin.names or face.names]
+    missing = [name for name in skin.names if name.lower() not in place]
+    if not missing and (face.X.ndim == 3) == skin.points:
+        found = face.X[:, [place[name] for name in names]] if names else face.X
+        if found[:1].size == len(found[:1]) * skin.columns:
+            return found
+    kinds = ["columns", "coordinates of points"]
+    lacking = f"; missing: {', '.join(missing[:_LISTED])}" if missing else ""
+    raise FormatError(
+        f"has {face.X[:1].size} {kinds[face.X.ndim == 3]}; {os.fspath(map_path)} was learned from {skin.columns} "
+        f"{kinds[skin.points]}, which are needed under the same names{lacking}.",
+        path=path,
+        hint="Learn the map again from the points of this file with `jawusd skin-fit`.",
+    )
+
+
 def read_face(
     path: str | os.PathLike[str],
     fps: float | None = None,
@@ -151,8 +181,7 @@ def read_face(
     marked = path.suffix.lower() == ".c3d" or not path.is_file() or path.suffix.lower() == ".trc"
     header = [] if marked else header_of(path)
     if "timecode" in header:
-        shapes = read_blend_shapes(path, fps)
-        face = FaceTable(shapes.frames, shapes.weights, shapes.names, shapes.fps)
+        face = read_blend_face(path, fps)
     elif is_face_table(header):
         face = read_face_table(path)
         face = FaceTable(face.frames, face.X, face.names, face.fps or fps)
@@ -168,6 +197,18 @@ def read_face(
     if rigid:
         points = in_head(points, face.names, rigid, rest_frame, unit, path)
     return FaceTable(face.frames, points, face.names, face.fps, "mm")
+
+
+def read_blend_face(path: str | os.PathLike[str], fps: float | None = None) -> FaceTable:
+    """Read all blend shapes of a CSV of Live Link Face; see `formats.arkit.read_blend_shapes`."""
+    shapes = read_blend_shapes(path, fps)
+    return FaceTable(shapes.frames, shapes.weights, shapes.names, shapes.fps)
+
+
+def read_jaw_weights(path: str | os.PathLike[str], fps: float | None = None) -> FaceTable:
+    """Read the four jaw weights of a CSV of Live Link Face; see `formats.arkit.read_arkit`."""
+    face = read_arkit(path, fps)
+    return FaceTable(face.frames, face.weights, JAW_COLUMNS, face.fps)
 
 
 def learn_skin(

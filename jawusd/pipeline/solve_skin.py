@@ -10,11 +10,10 @@ import numpy as np
 from jawusd.base.arrays import Array, Mask
 from jawusd.base.errors import FittingError, FormatError
 from jawusd.evaluator import JawRig
-from jawusd.evaluator.skin import Skin, SkinJaw
+from jawusd.evaluator.skin import SkinJaw
 from jawusd.fitting.face import columns_at
 from jawusd.fitting.skin import clock_offset
-from jawusd.formats.face_table import FaceTable
-from jawusd.pipeline.skin import load_own_skin, read_face
+from jawusd.pipeline.skin import load_own_skin, own_columns, read_face
 from jawusd.pipeline.solve_videos import SkinOptions
 
 # Minimum number of frames with visible teeth for comparison with the skin; standard deviation that is added to that of
@@ -40,11 +39,11 @@ class SkinOfShot:
         """
         self._skin = load_own_skin(rig, options.skin)
         face = read_face(options.face, options.fps, options.unit, options.rigid, options.rest_frame)
-        check_columns(self._skin, face, options)
+        columns = own_columns(self._skin, options.skin, face, options.face)
         if not face.fps:
             raise FormatError("does not state its frame rate.", path=options.face, hint="Give it with --face-fps.")
         self._rig, self._fps, self._face = rig, fps, options.face
-        self._face_s, self._columns = face.frames / face.fps, face.X.reshape(len(face.X), -1)
+        self._face_s, self._columns = face.frames / face.fps, columns.reshape(len(columns), -1)
         self.offset_s, self.unfamiliar = options.offset_s, np.zeros(0, np.int64)
 
     def frames(self) -> range:
@@ -116,22 +115,3 @@ def check_agreement(face: str | os.PathLike[str], found: SkinJaw, d: Array) -> N
             hint="Check that the face is of this shot, the offset of the clocks (--offset), and that the map was "
             "learned with this rig and the same points.",
         )
-
-
-def check_columns(skin: Skin, face: FaceTable, options: SkinOptions) -> None:
-    """Check that face data have the columns from which a map was learned.
-
-    Raises:
-        FormatError: number, kind or names of the columns differ.
-    """
-    names = skin.meta.get("names") or list(face.names)
-    count = face.X[:1].size
-    if count == skin.columns and (face.X.ndim == 3) == skin.points and names == list(face.names):
-        return
-    kinds = ["columns", "coordinates of points"]
-    raise FormatError(
-        f"has {count} {kinds[face.X.ndim == 3]}; {os.fspath(options.skin)} was learned from {skin.columns} "
-        f"{kinds[skin.points]}, and both must have the same names and order.",
-        path=options.face,
-        hint="Learn the map again from the points of this file with `jawusd skin-fit`.",
-    )

@@ -5,7 +5,6 @@ import json
 import pytest
 
 from jawusd.base.errors import FormatError
-from jawusd.formats.arkit import load_mapping
 from jawusd.formats.keys import load_keys
 from jawusd.formats.landmarks import load_landmarks
 from jawusd.formats.poses import read_parameters
@@ -38,13 +37,9 @@ def test_keys_of_several_names_are_read(tmp_path):
     assert read_toml(path)["a"]["b"]["c"] == {"d": {"e": 1}}
 
 
-ROW, ROWS = [0, 0, 0, 0], [[0, 0, 0, 0]] * 3
-MAPPING = {"actor": "Zoë", "neutral": ROW, "dead_zone": ROW, "rest_mm": [0, 0, 0]}
-MAPPING |= {"gain_mm": ROWS, "opened_gain_mm": ROWS}
 PLACES = {"format": "jawusd-landmarks/1", "units": "mm", "landmarks": {name: [1, 2, 3] for name in LANDMARKS}}
 FILES = {
     "keys.json": (json.dumps({"fps": 24, "keys": [{"frame": 0, "d": [0, 0, 0]}]}, indent=1), load_keys),
-    "arkit.json": (json.dumps(MAPPING, indent=1, ensure_ascii=False), load_mapping),
     "landmarks.json": (json.dumps(PLACES, indent=1), lambda path: load_landmarks(path).landmarks.tolist()),
     "d.json": (json.dumps([{"frame": 1, "d1": 1, "d2": 2, "d3": 3}]), lambda path: read_parameters(path)[1].tolist()),
     "capture.toml": ('name = "Zoë"\n[a]\nb = 1 # c\n', read_toml),
@@ -80,20 +75,3 @@ def test_json_and_toml_of_every_encoding_are_read(tmp_path, name, encoding, end)
 def test_what_is_not_json_is_named_with_its_line(tmp_path, text, words):
     with pytest.raises(FormatError, match=words):
         parse_json(text, tmp_path / "a.json")
-
-
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        ({"neutral": [0, 0, 0]}, "neutral needs four numbers within"),
-        ({"gain_mm": [[0, 0, 0, 0]] * 2}, "gain_mm needs three rows of four numbers"),
-        ({"dead_zone": [0, 0, 0, -1]}, "dead_zone needs four numbers within .*, none below 0, found -1"),
-        ({"gains": 1}, 'unknown key "gains"; allowed keys: format, actor'),
-        ({"format": "jawusd-arkit/9"}, 'format needs "jawusd-arkit/1", found "jawusd-arkit/9"'),
-    ],
-)
-def test_what_a_mapping_needs_is_said(tmp_path, change, words):
-    (tmp_path / "arkit.json").write_text(json.dumps(MAPPING | change))
-    with pytest.raises(FormatError, match=words) as error:
-        load_mapping(tmp_path / "arkit.json")
-    assert "arkit-fit" in str(error.value)

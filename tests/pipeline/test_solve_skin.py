@@ -80,7 +80,7 @@ def test_skin_of_another_subject_or_other_points_is_refused(shot, tmp_path):
         SkinOfShot(person("ben"), options, FPS)
     other = write_face(tmp_path / "face.csv", np.zeros((5, 4, 3)))
     other.write_text(other.read_text().replace("chin", "nose"))
-    with pytest.raises(FormatError, match="12 coordinates of points.*must have the same names and order"):
+    with pytest.raises(FormatError, match="12 coordinates of points.*same names; missing: chin"):
         SkinOfShot(rig, replace(options, face=other), FPS)
     other.write_text("frame,a,b\n0,1,2\n1,2,3\n")
     with pytest.raises(FormatError, match="2 columns;.* learned from 12 coordinates"):

@@ -42,7 +42,7 @@ def calls(folder):
         "encode": ["encode", rig, f"{folder}/poses.csv", "-o", f"{out}/d.csv"],
         "animate": ["animate", rig, f"{folder}/keys.json", "-o", f"{rig}/anim_keys.usdc"],
         "animate glb": ["animate", rig, f"{folder}/keys.json", "-o", f"{out}/anim.glb"],
-        "arkit-fit": ["arkit-fit", rig, f"{folder}/face.csv", f"{folder}/d.csv", "-o", f"{out}/arkit.json"],
+        "arkit-fit": ["arkit-fit", rig, f"{folder}/face.csv", f"{folder}/d.csv", "-o", f"{out}/arkit.npz"],
         "align": ["align", rig, f"{folder}/points.json", "-o", f"{out}/T_skull_model.json"],
         "skin-fit": ["skin-fit", rig, f"{folder}/d.csv", f"{folder}/face.csv", "-o", f"{out}/skin.npz"],
         "arkit-table": ["arkit-table", rig, "-o", f"{out}/joint.csv"],
