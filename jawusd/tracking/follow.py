@@ -59,6 +59,7 @@ class TwoWays(Generic[P]):
         fit_px: returns the length of the contour that fits a pose [px].
         margin: ratio of these lengths above which another pose replaces a trusted one.
         jump_mm: second difference of the motion of the lower teeth above which earlier frames are followed again [mm].
+        patience: number of successive lost frames in which no arch is gained after which following back ends.
         progress: called with the number of frames followed and the total.
         known: poses by frame.
     """
@@ -68,6 +69,7 @@ class TwoWays(Generic[P]):
     fit_px: Callable[[P], float]
     margin: float = 1.0
     jump_mm: float = _JUMP_MM
+    patience: int = 1
     progress: Callable[[int, int], None] = lambda done, total: None
     known: MutableMapping[int, P] = field(default_factory=dict)
 
@@ -129,10 +131,15 @@ class TwoWays(Generic[P]):
             True if an equal trusted pose was met, False if a different one that fits better, None if an arch was lost
             and no other one gained, or the take ended.
         """
+        misses = 0
         for frame, other in zip(way, followed, strict=False):
             old = self.known[frame]
             if not other.found.all() and not gained(other, old):
-                return None
+                misses += 1
+                if old.found.all() or misses == self.patience:
+                    return None
+                continue
+            misses = 0
             if trust(old) == 2 and frame not in doubted:
                 if self._apart_mm(other, old) < _SAME_MM:
                     return True

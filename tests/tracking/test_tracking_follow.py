@@ -123,6 +123,15 @@ def test_uncertain_poses_keep_the_better_fit():
     assert [known.known[frame].value for frame in (20, 21, 22, 23)] == [20.0, 0.0, 22.0, 23.0]
 
 
+@pytest.mark.parametrize(("patience", "lost"), [(1, [21, 22]), (2, [22])])
+def test_following_back_goes_on_through_a_few_lost_frames(patience, lost):
+    known = take([21, 22, 23])
+    known.patience = patience
+    followed = [Pose(23.0), Pose(22.0, False), Pose(21.0), Pose(20.0)]
+    assert known.replace(range(23, 19, -1), iter(followed)) is (True if patience > 1 else None)
+    assert [frame for frame in FRAMES if not known.known[frame].is_found] == lost
+
+
 def test_doubted_poses_are_not_trusted():
     """Poses equal to doubted ones do not end a replacement, nor do better doubted ones; these are kept."""
     known = take(wrong={21: Pose(0.0, fit=2.0)})

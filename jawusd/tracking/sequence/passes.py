@@ -26,6 +26,9 @@ Progress = Callable[[int, int], None]
 # Maximum number of frames around a restart from which the tracker is initialised: without this limit, long takes with
 # many gaps would take quadratic time.
 _NEARBY_FRAMES = 4000
+# Number of lost frames through which teeth are followed back: wrong masks often last for a few frames, and with masks
+# lost frames are tried fast.
+_PATIENCE = 16
 
 
 class Passes:
@@ -64,6 +67,7 @@ class Passes:
             self._places,
             _fitting_px,
             jump_mm=np.inf,  # masks show whether a pose is wrong
+            patience=_PATIENCE,
             progress=self._progress,
             known=self.records,
         )
