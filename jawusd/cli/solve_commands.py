@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -56,7 +56,8 @@ ReportFile = Annotated[
 SkinFile = Annotated[
     Path | None,
     typer.Option(
-        help="Map from facial skin to d, written by skin-fit, for frames with hidden teeth. Needs --face.",
+        help="For frames with hidden teeth: map from facial skin to d, written by skin-fit, with --face; or the word "
+        "footage, to follow skin in the videos and learn from the frames with visible teeth.",
         show_default=False,
     ),
 ]
@@ -121,7 +122,11 @@ def solve(
     """Track a performance of a subject with a rig, from masks or, without masks, videos of one or more cameras."""
     from jawusd.pipeline import solve as stage
 
-    given = _skin_options(skin, face, face_fps, offset, rigid, rest_frame, length_unit, skin_only)
+    given: SkinOptions | Literal["footage"] | None
+    if skin == Path("footage") and face is None and not skin_only:
+        given = "footage"
+    else:
+        given = _skin_options(skin, face, face_fps, offset, rigid, rest_frame, length_unit, skin_only)
     stage.check_output(rig, out, overlay, report)
     written = [path for path in (out, overlay, report) if path is not None]
     for path in written:
@@ -173,6 +178,13 @@ def solve_lines(summary: SolveSummary) -> list[str]:
     """Return `solve_summary` as text."""
     seen_by = ", ".join(summary["cameras"]) or "no camera"
     lines = [f"solved {summary['solved']} of {summary['frames']} frames with {seen_by}"]
+    if "skin_learned" in summary:
+        learned = summary["skin_learned"]
+        errors = learned["errors_mm"]
+        lines.append(
+            f"  learned from {learned['points']} points on the skin in {learned['frames']} frames with visible teeth; "
+            f"held-out error {errors['skin']:.2f} mm, chin rigid with the bone {errors['chin']:.2f} mm"
+        )
     if "skin_offset_s" in summary:
         lines.append(f"  the face starts {summary['skin_offset_s']:.3f} s after frame 0 of the shot")
     for word, runs in (

@@ -59,6 +59,7 @@ def fit_skin(
     *,
     head_error: tuple[float, float] = HEAD_ERROR,
     names: Sequence[str] = (),
+    chin_as_good: bool = False,
 ) -> Skin:
     """Learn the jaw parameters d from facial skin.
 
@@ -76,6 +77,7 @@ def fit_skin(
             frames: root mean square shift [mm] and rotation about the points' centre [rad]. The predicted covariances
                 include this error.
         names: Names of the columns or points, stored in the file.
+        chin_as_good: Accept an error near or above that of a chin rigid with the bone.
 
     Returns:
         The map. In its meta, "errors_mm" contains the mean held-out errors at the incisal point: that of the map
@@ -105,7 +107,7 @@ def fit_skin(
     if points and X.shape[1] >= _CHIN_POINTS:
         guesses["chin"] = _of_chin(rig, X, d, blocks)
     errors = {name: incisal_error(rig, guess, d) for name, guess in guesses.items()}
-    _check_errors(errors)
+    _check_errors({name: value for name, value in errors.items() if name != "chin" or not chin_as_good})
     strange = np.column_stack([variance, _outside(flat, blocks, float(arrays["scale"]))])
     arrays["familiar_limit"] = np.maximum(np.quantile(strange, 1 - _FALSE_ALARMS / 2, axis=0), _TINY)
     flagged = (strange > arrays["familiar_limit"]).any(axis=1)

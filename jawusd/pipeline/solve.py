@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, NotRequired, TypedDict, cast
+from typing import TYPE_CHECKING, Literal, NotRequired, TypedDict, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,6 +39,14 @@ SUFFIXES = (".csv", ".npz", ".usdc", ".usda")
 _USD = (".usd", ".usda", ".usdc", ".usdz")
 
 
+class SkinLearned(TypedDict):
+    """What was learned from skin in the footage of a shot; see `fitting.skin.fit_skin`."""
+
+    points: int  # number of points on the skin
+    frames: int  # number of frames with visible teeth
+    errors_mm: dict[str, float]
+
+
 class SolveSummary(TypedDict):
     """Key figures of a solved performance; counts are numbers of frames."""
 
@@ -56,6 +64,7 @@ class SolveSummary(TypedDict):
     focal: NotRequired[
         dict[str, tuple[float, float]]
     ]  # ratio of estimated to calibrated focal length, and its standard deviation, by camera
+    skin_learned: NotRequired[SkinLearned]
     skin_offset_s: NotRequired[float]  # seconds from frame 0 of the shot to frame 0 of the face data
     unfamiliar: NotRequired[list[tuple[int, int]]]  # runs of `skin` with a face unlike those of the calibration
     findings: NotRequired[list[dict[str, str | float | int]]]
@@ -74,7 +83,7 @@ def solve(
     free_focal: bool = False,
     jobs: int = 2,
     allow_outside: bool = False,
-    skin: SkinOptions | None = None,
+    skin: SkinOptions | Literal["footage"] | None = None,
     progress: Progress | None = None,
 ) -> Performance:
     """Solve for head pose and jaw parameters in every frame of a shot; optionally write them to a file.
@@ -93,15 +102,17 @@ def solve(
         jobs: number of threads; the result does not depend on it.
         allow_outside: allow paths in the capture that point outside its folder.
         skin: facial skin data of the shot, which determine d in frames with hidden teeth. With them, the shot needs no
-            images.
+            images. "footage": points on the skin are followed in the videos of two or more cameras, and d is learned
+            from them in the frames with visible teeth.
 
     Raises:
         FormatError, RigError: the rig or a skin file cannot be read.
-        FittingError: the skin data do not belong to the rig or the shot.
+        FittingError: the skin data do not belong to the rig or the shot, or the jaw cannot be learned from the footage.
         CaptureError, CalibrationError, SyncError: see `track`.
         TrackingError: the teeth cannot be found in the masks or the videos.
         OutputError: a file cannot be written.
     """
+    from jawusd.pipeline.skin_footage import SkinOfFootage, skin_of_footage
     from jawusd.pipeline.solve_skin import SkinOfShot
     from jawusd.tracking.performance.results import tracks_of
 
@@ -109,18 +120,23 @@ def solve(
     progress = progress or no_progress
     capture = open_capture(shot, allow_outside=allow_outside)
     jaw = jawusd.load(rig, prim=prim)
-    by_skin = None if skin is None else SkinOfShot(jaw, skin, capture.fps)
-    if skin is not None and by_skin is not None and (skin.only or not _has_images(capture)):
+    by_skin = SkinOfShot(jaw, skin, capture.fps) if isinstance(skin, SkinOptions) else None
+    learned: SkinOfFootage | None = None
+    if isinstance(skin, SkinOptions) and by_skin is not None and (skin.only or not _has_images(capture)):
         if overlay is not None:
             raise OutputError("needs the head pose, which cannot be estimated from skin alone.", path=overlay)
         offsets: dict[str, int] = {}
         found, findings = _from_skin(capture, jaw, by_skin)
     else:
         offsets = sync_cameras(capture, progress)["offsets"]
-        options = VideoOptions(fixed_head, free_focal, jobs, by_skin)
+        if skin == "footage":
+            learned = skin_of_footage(capture, jaw, offsets, free_focal, progress)
+        options = VideoOptions(fixed_head, free_focal, jobs, by_skin or learned)
         found, findings = _from_images(capture, jaw, offsets, options, progress)
     if by_skin is not None:
         found.notes |= {"skin_offset_s": by_skin.offset_s, "unfamiliar": by_skin.unfamiliar.tolist()}
+    if learned is not None:
+        found.notes["skin_learned"] = learned.summary()
     known = cast("list[dict[str, str | float | int]]", found.notes.get("findings", []))
     found.notes["findings"] = [*known, *(finding.as_json() for finding in findings)]
     if out is not None:
@@ -170,7 +186,9 @@ def _naming_skin_only(options: VideoOptions) -> Iterator[None]:
     try:
         yield
     except TrackingError as error:
-        if options.skin is not None:
+        from jawusd.pipeline.solve_skin import SkinOfShot
+
+        if isinstance(options.skin, SkinOfShot):
             error.hint = f"{error.hint or ''} If no frame shows the teeth, use --skin-only.".strip()
         raise
 
@@ -280,6 +298,8 @@ def solve_summary(performance: Performance) -> SolveSummary:
     )
     if "focal" in p.notes:
         summary["focal"] = cast("dict[str, tuple[float, float]]", p.notes["focal"])
+    if "skin_learned" in p.notes:
+        summary["skin_learned"] = cast(SkinLearned, p.notes["skin_learned"])
     if "skin_offset_s" in p.notes:
         summary["skin_offset_s"] = cast(float, p.notes["skin_offset_s"])
         summary["unfamiliar"] = _runs(np.intersect1d(by_skin, cast("list[int]", p.notes["unfamiliar"])))

@@ -55,13 +55,14 @@ class SkinOfShot:
         first, last = (self._face_s[[0, -1]] + self._known_offset()) * self._fps
         return range(max(ceil(first), 0), max(floor(last) + 1, 0))
 
-    def __call__(self, frames: Array, d: Array, seen: Mask) -> SkinJaw:
+    def __call__(self, frames: Array, d: Array, seen: Mask, heads: Array | None = None) -> SkinJaw:
         """Return the jaw parameters estimated from skin in some frames.
 
         Args:
             frames: frame numbers of the shot, shape (F,).
             d: jaw parameters [mm], shape (F, 3).
             seen: frames in which d was measured, shape (F,).
+            heads: not used, since the face is relative to the head.
 
         Raises:
             FittingError: the offset between the clocks is unknown and cannot be estimated, no frame has a familiar

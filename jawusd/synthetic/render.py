@@ -123,6 +123,7 @@ class Renderer:
             part = self._parts[name]
             _write(program, "world_from_part", T)
             program["label"] = float(part.label)
+            program["freckles"] = part.freckles
             part.vao.render()
         self._gl.disable(moderngl.DEPTH_TEST | moderngl.CULL_FACE)
 
@@ -236,7 +237,7 @@ class _Part:
     """GPU buffers of one surface."""
 
     def __init__(self, gl: moderngl.Context, program: moderngl.Program, surface: Surface, label: int) -> None:
-        self.label = label
+        self.label, self.freckles = label, surface.freckles
         self._faces = surface.faces
         fixed = np.concatenate(
             [surface.colors, np.stack([surface.gloss, surface.skin, surface.inside], -1), surface.vertices], axis=1

@@ -37,6 +37,7 @@ uniform vec3 eye;
 uniform mat4 head_from_world;
 uniform float label;
 uniform float light;
+uniform float freckles;
 uniform sampler3D grain;   // smooth noise and its gradient, each 0..1
 layout(location = 0) out vec4 out_color;
 
@@ -58,6 +59,9 @@ void main() {
         vec4 pore = texture(grain, rest * 0.10 + 0.6) - 0.5;
         albedo *= 1.0 + material.y * (vec3(0.10, 0.20, 0.22) * blotch + 0.10 * fine.r + 0.08 * pore.r);
         n = normalize(n - material.y * (0.16 * fine.gba + 0.14 * pore.gba));
+        // spots of about 2 mm on a tenth of the skin, none on the red of the lips
+        float spot = smoothstep(0.67, 0.75, texture(grain, rest * 0.028 + 0.17).r);
+        albedo *= 1.0 - freckles * spot * step(0.95, material.y);
     }
     float depth = (head_from_world * vec4(world, 1.0)).z;
     float open_air = mix(1.0, mix(0.10, 1.0, smoothstep(-66.0, 0.0, depth)), material.z);

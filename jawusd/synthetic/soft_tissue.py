@@ -66,6 +66,7 @@ class Surface:
     gloss: Array  # strength of the highlight, shape (V,), 0..1
     skin: Array  # strength of the skin texture, shape (V,), 0..1
     inside: Array  # 1 inside the mouth, where the light decreases with depth; 0 elsewhere; shape (V,)
+    freckles: float = 0.0  # darkness of freckles where the skin texture has full strength, 0..1
 
 
 class Face:

@@ -215,8 +215,8 @@ def _tongue(controls: Array, rng: np.random.Generator) -> Array:
 class Scene:
     """All surfaces of one subject, ready to render."""
 
-    def __init__(self, person: Person, anatomy: PersonAnatomy, renderer: Renderer) -> None:
-        """Add the subject's surfaces to the renderer."""
+    def __init__(self, person: Person, anatomy: PersonAnatomy, renderer: Renderer, freckles: float = 0.0) -> None:
+        """Add the subject's surfaces to the renderer; the face has freckles of a darkness of 0..1."""
         self._renderer = renderer
         self.anatomy = anatomy
         self._face = Face(person.joint.incisor)
@@ -226,14 +226,18 @@ class Scene:
             renderer.add(f"{name} gum", gum)
         face = self._face
         vertices = face.posed(LipState(8.2, 8.2, 27.5, 0.0), np.eye(4))
-        renderer.add("face", Surface(vertices, face.faces, face.colors, face.gloss, face.skin, face.inside))
+        renderer.add("face", Surface(vertices, face.faces, face.colors, face.gloss, face.skin, face.inside, freckles))
         renderer.add("palate", palate())
         renderer.add("tongue", tongue(0.0, 0.0, 0.0))
 
-    def pose(self, take: Take, index: int) -> dict[str, Array]:
-        """Deform lips and tongue for a frame of a take; return the poses T_world_part (4, 4) of all surfaces."""
+    def pose(self, take: Take, index: int, slide_mm: Array | float = 0.0) -> dict[str, Array]:
+        """Deform face and tongue for a frame of a take; return the poses T_world_part (4, 4) of all surfaces.
+
+        Args:
+            slide_mm: displacements added to the vertices of the face, skull frame [mm], shape (V, 3) or ().
+        """
         T_jaw, head = take.T_skull_mandible[index], take.T_world_skull[index]
-        self._renderer.move("face", self._face.posed(take.lips[index], T_jaw))
+        self._renderer.move("face", self._face.posed(take.lips[index], T_jaw) + slide_mm)
         self._renderer.move("tongue", tongue(*take.tongue_mm[index]).vertices)
         jaw = head @ T_jaw
         return {

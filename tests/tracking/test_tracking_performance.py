@@ -176,8 +176,8 @@ def test_skin_measures_the_jaw_while_one_camera_sees_no_teeth(jaw, scans, truth,
     familiar, covariance = ~np.isin(np.arange(COUNT), strange), np.tile(0.2 * np.eye(3), (COUNT, 1, 1))
     covariance[strange] *= 50.0
 
-    def skin(frames, d, seen):
-        assert len(frames) == len(d) == COUNT and frames[0] == small_take.FIRST
+    def skin(frames, d, seen, heads):
+        assert len(frames) == len(d) == len(heads) == COUNT and frames[0] == small_take.FIRST
         np.testing.assert_array_equal(np.flatnonzero(~seen), hidden)
         return SkinJaw(measured, covariance, familiar)
 

@@ -123,7 +123,7 @@ def test_skin_alone_is_solved_and_stored(jaw, tmp_path):
     measured[~familiar] = np.nan
     scans = tuple(prepare_scan(mesh, row) for mesh, row in zip(small_take.MESHES, small_take.ROWS))
     by_skin = SkinJaw(measured, np.tile(C, (count, 1, 1)), familiar)
-    found = solve_by_skin(jaw, scans, lambda frames, d, seen: by_skin, range(7, 7 + count), FPS)
+    found = solve_by_skin(jaw, scans, lambda frames, d, seen, heads: by_skin, range(7, 7 + count), FPS)
     assert found.frames[0] == 7 and found.camera_names == ()
     np.testing.assert_array_equal(found.state == SolveState.SKIN, familiar)
     np.testing.assert_array_equal(found.state == SolveState.CARRIED, ~familiar)

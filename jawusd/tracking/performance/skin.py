@@ -19,8 +19,9 @@ from jawusd.tracking.performance.attempts import FrameFit
 from jawusd.tracking.performance.system import TakeSystem
 
 #: Function that returns the jaw parameters estimated from facial skin in some frames. Arguments: frame numbers, shape
-#: (F,); d of the first pass [mm], shape (F, 3); and whether both arches were found in each frame, shape (F,).
-SkinOf = Callable[[Array, Array, Mask], SkinJaw]
+#: (F,); d of the first pass [mm], shape (F, 3); whether both arches were found in each frame, shape (F,); and poses of
+#: the head T_world_skull, shape (F, 4, 4).
+SkinOf = Callable[[Array, Array, Mask, Array], SkinJaw]
 
 SLOW = 3  # number of unknowns per frame: the slow error in units of its standard deviation
 # Fraction of the variance that belongs to the slow error, its time constant [s], and the time over which fast errors
@@ -159,5 +160,5 @@ def jaw_of_skin(skin: SkinOf | None, frames: Sequence[int], fits: Sequence[Frame
     """Return the jaw parameters estimated from skin in the frames of a first pass; None without skin data."""
     if skin is None:
         return None
-    d = np.stack([fit.pose.d for fit in fits])
-    return skin(np.asarray(frames, np.float64), d, np.array([fit.found.all() for fit in fits]))
+    d, heads = np.stack([fit.pose.d for fit in fits]), np.stack([fit.pose.head for fit in fits])
+    return skin(np.asarray(frames, np.float64), d, np.array([fit.found.all() for fit in fits]), heads)

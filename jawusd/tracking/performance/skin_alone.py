@@ -35,7 +35,9 @@ def solve_by_skin(jaw: JawRig, scans: Sequence[Scan], skin: SkinOf, frames: rang
     coordinates = Coordinates(jaw, scans)
     count, none = len(frames), np.zeros((2, 0), bool)
     fits = [FrameFit(Pose(np.eye(4), np.zeros(3)), None, none, none, np.zeros((2, 0)))] * count
-    by_skin = skin(np.array(frames, np.float64), np.zeros((count, 3)), np.zeros(count, bool))
+    by_skin = skin(
+        np.array(frames, np.float64), np.zeros((count, 3)), np.zeros(count, bool), np.tile(np.eye(4), (count, 1, 1))
+    )
     instants = InstantSolver(ContourSolver(scans, TrackingConfig()), coordinates)
     smoothed = Smoother(instants, None, frames, fps, 0, skin=by_skin).run(fits)
     covariance = smoothed.covariance.copy()
