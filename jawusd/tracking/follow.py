@@ -182,14 +182,14 @@ class TwoWays(Generic[P]):
             yield frame, away_mm
 
     def _turning_points(self, way: range) -> Iterator[int]:
-        """Yield the frames trusted more than their predecessor, with an arch gained, or with implausible acceleration.
+        """Yield the frames that are trusted more than their predecessor, or at which the jaw accelerates implausibly.
 
         Poses may be replaced in the meantime.
         """
         for k in range(1, len(way)):
             jumps = k > 1 and self._bend_mm(way[k - 2 : k + 1]) > self.jump_mm
             pose, last = self.known[way[k]], self.known[way[k - 1]]
-            if jumps or gained(pose, last) or trust(pose) > trust(last):
+            if jumps or trust(pose) > trust(last):
                 yield way[k]
 
     def _apart_mm(self, one: P, other: P) -> float:

@@ -132,6 +132,13 @@ def test_following_back_goes_on_through_a_few_lost_frames(patience, lost):
     assert [frame for frame in FRAMES if not known.known[frame].is_found] == lost
 
 
+def test_an_arch_that_is_gained_alone_is_kept():
+    known = take([20, 21])
+    known.known[21].has_upper = False
+    assert known.replace(range(21, 19, -1), iter([Pose(21.0, False), Pose(20.0, False)])) is None
+    assert known.known[21].has_upper
+
+
 def test_doubted_poses_are_not_trusted():
     """Poses equal to doubted ones do not end a replacement, nor do better doubted ones; these are kept."""
     known = take(wrong={21: Pose(0.0, fit=2.0)})
@@ -144,21 +151,6 @@ def test_a_lost_frame_ends_a_replacement():
     known = take([20, 21, 22])
     assert replaced(known, {20: Pose(20.0), 21: Pose(21.0, False), 22: Pose(22.0)}) is None
     assert [bool(known.known[frame].found.all()) for frame in (20, 21, 22)] == [True, False, False]
-
-
-def test_one_arch_is_followed_back_while_the_other_stays_lost():
-    """Without upper teeth from 14 on, the lower ones are lost from 16 to 18: found in 19, they are followed back."""
-    alone = {frame: Pose(float(frame), frame not in (16, 17, 18), has_upper=False) for frame in range(14, 30)}
-    tracker = Tracker(alone)
-    again = {frame: Pose(float(frame), has_upper=False) for frame in range(14, 30)}
-
-    def follow(way, pose):
-        return iter([again.get(frame, Pose(float(frame))) for frame in way]) if way.step < 0 else tracker(way, pose)
-
-    known = of_frames()
-    known.follow(Begin(10, Pose(10.0), follow))
-    assert [frame for frame in FRAMES if not known.known[frame].is_found] == []
-    assert [frame for frame in FRAMES if not known.known[frame].has_upper] == list(range(14, 30))
 
 
 @pytest.mark.parametrize("step", [1, -1])
