@@ -256,7 +256,8 @@ def viewer(out: Path, folder: Path) -> Path:
         served.show(actor.load_clip(actor.take).at(VIEWED_FRAME))
         (shown,) = served.pages.values()
         shown.motion.show(float(VIEWED_FRAME))
-        page.wait_for_selector("img:visible")
+        if actor.footage is not None:
+            page.wait_for_selector("img:visible")
         page.wait_for_timeout(4000)  # jaw and footage are drawn
         picture = page.screenshot()
     return save_webp(folder / "viewer.webp", Image.open(io.BytesIO(picture)), 1200)

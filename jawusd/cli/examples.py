@@ -37,7 +37,7 @@ EXAMPLES = {
     ),
     "live": (
         "jawusd live out shot --source left=/dev/video0 --osc 127.0.0.1:9000 --view",
-        "face_tracker | jawusd live out shot --source left=/dev/video0 --skin skin.npz --face -",
+        "jawusd live out shot --source left=/dev/video0 --skin skin.npz --face face.csv",
     ),
     "rebake": ("jawusd rebake shot.usda -o jaws.usdc", "jawusd rebake out export.fbx -o anim_edited.usdc"),
     "arkit-fit": ("jawusd arkit-fit out face.csv take.npz -o arkit.npz",),
