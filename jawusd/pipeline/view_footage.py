@@ -29,11 +29,8 @@ _TILE_PX = (480, 360)
 def take_footage(folder: Path, tile_px: tuple[int, int] = _TILE_PX) -> ViewedFootage | None:
     """Return the footage, or the masks, of the take from which a rig was built, in images of a size (width, height).
 
-    Returns None if the folder is not that of a build, or if the capture that the build records cannot be read, as after
-    the rig was moved.
-
-    Raises:
-        FormatError: tracks.npz cannot be read.
+    Returns None if the folder is not that of a build, or if a file of the build or the capture that it records cannot
+    be read, as after the rig was moved.
     """
     from jawusd.viewer.viewed import ViewedFootage
 
@@ -41,13 +38,13 @@ def take_footage(folder: Path, tile_px: tuple[int, int] = _TILE_PX) -> ViewedFoo
         return None
     try:
         state = BuildState(folder)
+        facts, offsets = build_facts(folder, state, None), recorded_offsets(state)
+        tracks = load_tracks(folder / _TRACKS)
     except FormatError:  # `jawusd validate` reports it; the rig can still be shown
         return None
-    facts, offsets = build_facts(folder, state, None), recorded_offsets(state)
     if facts.capture is None:
         return None
     names = [source.name for source in facts.capture.cameras if source.video or source.masks]
-    tracks = load_tracks(folder / _TRACKS)
     if not names or not set(names) <= set(offsets) or not len(tracks.frames):
         return None
     frames = int(tracks.frames[0]), int(tracks.frames[-1])

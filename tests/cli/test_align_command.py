@@ -35,4 +35,4 @@ def test_align_writes_what_solvers_need(tmp_path):
     run("align", model, points, "-o", out, code=10)  # the output exists
     points_file(points, rig, points={"incisor": {"model": [0, 0, 0], "sigma_mm": 1}})
     refused = run("align", model, points, "-o", out, "--force", code=7)
-    assert "points.json" in refused and "at least 3 are needed" in refused
+    assert "points.json" in refused and "at least 3 that" in refused

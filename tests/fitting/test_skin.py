@@ -112,7 +112,7 @@ def test_a_map_no_better_than_a_rigid_chin_is_refused(take):
     truth = person.rig.project(np.where(seen[:, None], d, 0.0))
     arms = np.array([[0.0, -30, 5], [12.0, -28, 0], [-12.0, -28, 0], [0, -5, 3]])
     rigid = transform_points(person.rig.pose(truth), person.rig.landmarks[0] + arms)
-    with pytest.raises(FittingError, match="a chin rigid with the bone has 0.0"):
+    with pytest.raises(FittingError, match="of a chin rigid with the bone is 0.0"):
         jawusd.fit_skin(person.rig, rigid, truth, seen, 0.01)
 
 

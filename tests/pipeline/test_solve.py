@@ -233,7 +233,7 @@ def test_a_shot_is_solved_from_skin_alone(rig, shot, tmp_path):
     words += [tmp_path / "face.csv", "--face-fps", open_capture(shot).fps, "--skin-only"]
     assert "with --offset" in run(*words, code=7)
     words += ["--offset", 0]
-    assert "pose of the head" in run(*words, "--overlay", tmp_path / "take.mp4", code=10)
+    assert "head pose" in run(*words, "--overlay", tmp_path / "take.mp4", code=10)
     said = run(*words, "--report", tmp_path / "take.html")
     assert "estimated from facial skin: " in said and "with no camera" in said
     tracks = load_tracks(tmp_path / "take.npz")

@@ -141,7 +141,7 @@ def _fits(share, rough_px, frames=5):
     none, weight = OutlineSums.zeros(3), np.full((2, 3), 100.0)
     edges = none._replace(score_px=500 * share, weight=weight, square=100 * 0.828 * rough**2)
     solution = SimpleNamespace(silhouette=edges, gingival_margin=none, visible_px=np.full((2, 3), 500.0))
-    return {k: SimpleNamespace(solution=solution, status=np.ones(2, np.int8)) for k in range(frames)}
+    return {k: SimpleNamespace(solution=solution, found=np.ones(2, bool)) for k in range(frames)}
 
 
 @pytest.mark.parametrize(
