@@ -190,7 +190,7 @@ class SkinFollower:
         return out
 
     def _anchored(self, c: int, image: Gray, start: Array, guess: Array, side: int) -> tuple[Array, Mask]:
-        """Align points (N, 2) of the key frame with an image, near a guess (N, 2); and return which are alike."""
+        """Align points (N, 2) of the key frame with an image, from a guess (N, 2); return which look alike in both."""
         found, ok = followed(self._key[c], image, start, side, guess, levels=1)
         ok &= np.linalg.norm(found - guess, axis=1) <= _STEP_PX
         return found, ok & (alike(self._key[c], image, start, found, side) >= _ALIKE)

@@ -31,7 +31,7 @@ Derivative = Callable[[Array], tuple[Array, Array, Array]]
 # Weight of a distance along the line of sight relative to one across it. The weight matters only at the bound:
 # elsewhere, two equations across the sight and one along it determine d.
 _DEPTH_WEIGHT = 0.1
-_MIN_PRECISION = 1e-12  # minimum precision of d in every direction, relative to its trace
+_MIN_PRECISION = 1e-12  # minimum precision of d in every direction, relative to the trace of the precision
 
 
 def landmark_vectors(landmarks: Array) -> Array:

@@ -299,7 +299,7 @@ def _carried(d: Array, blocks: list[Indices]) -> Array:
 
 
 def _of_chin(rig: JawRig, X: Array, d: Array, blocks: list[Indices]) -> Array:
-    """Return d (M, 3) of held-out blocks by inverse kinematics of the skin points that best follow the bone."""
+    """Return d (M, 3) of held-out blocks, by inverse kinematics from the skin points that follow the bone best."""
     poses, found = rig.pose(d), np.empty_like(d)
     for b in blocks:
         others = np.delete(np.arange(len(d)), b)

@@ -33,8 +33,8 @@ _FEWEST = 12  # minimum number of images for estimating the typical change betwe
 _LEAST_CHANGE = 0.1  # minimum change [of 255 levels] that counts as noise or motion
 # Maximum change, relative to the usual change, in a run of repeated images, and in a run of only one or two images.
 _SAME, _ALIKE = 0.05, 0.03
-# Lengths of runs of repeated images: maximum of a short run, minimum for comparison with noise, minimum at a clip's
-# end.
+# Lengths of runs of repeated images: maximum of a short run, minimum of a run that is compared with noise, minimum
+# at a clip's end.
 _SHORT, _SOME, _LONG = 2, 5, 12
 # Range of the change before a run, and minimum change after it, both as multiples of the usual change.
 _STOPS, _FARTHER = (0.5, 4.0), 1.25

@@ -159,7 +159,7 @@ def _checked_layers(path: Path) -> list[Sdf.Layer]:
             rig_folder = file_of(name).resolve().parent
         if rig_folder is None and ref.user is not None:
             raise RigError(
-                f"refers to the file {name:.200}, which is outside its own folder and not a rig.",
+                f"refers to the file {name:.200}, which is outside the folder of this file and not a rig.",
                 path=ref.user,
                 hint=_ALLOW,
             )
@@ -222,7 +222,7 @@ def _checked_file(layer: Sdf.Layer, asset: str, folder: Path) -> Path:
     """
     target = target_of(layer, asset)
     if target is None or not (is_allowed(file_of(target)) or file_of(target).resolve().is_relative_to(folder)):
-        found = f"refers to the file {asset:.200}, outside its own folder."
+        found = f"refers to the file {asset:.200}, outside the folder of this file."
         raise RigError(found, path=layer.identifier, hint=_ALLOW)
     return file_of(target)
 

@@ -157,7 +157,7 @@ def _group_contrast(
 
 
 def _parts_near(parts: NDArray[np.int32], group: Mask) -> list[int]:
-    """Return the labels of the parts in and near a group of teeth that may be teeth, judging by size and position."""
+    """Return the labels of the parts near a group of teeth whose size and position are those of teeth."""
     rows, columns = np.nonzero(group)
     reach = _ROWS_APART * (np.ptp(columns) + 1)
     around = np.zeros(parts.shape, bool)

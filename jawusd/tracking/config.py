@@ -101,7 +101,7 @@ class TrackingConfig:
     uneven_residual: float = 1.6
     # Fraction of a mask's recent median score below which the mask does not show the arch [-].
     dead_score: float = 0.03
-    # Penalty per uncovered mask pixel, in px of contour [1/px]: rejects wrong local minima if few edges are visible.
+    # Matched contour [px] that outweighs one uncovered mask pixel: rejects wrong minima if few edges are visible.
     uncovered_price: float = 0.5
     # Minimum gain in the objective of the other masks, relative to their score, for excluding a mask as wrong [-].
     conflict_gain: float = 0.15

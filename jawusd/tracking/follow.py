@@ -111,7 +111,7 @@ class TwoWays(Generic[P]):
                 vain.update(lost)
 
     def _joined(self, begin: Begin[P]) -> bool:
-        """Replace poses from a frame on, both ways; return whether that does not contradict what is known."""
+        """Follow from a frame in both directions, and replace poses; return whether these agree with trusted ones."""
         self.known[begin.frame] = begin.pose
         ways = both_ways(begin.frame, self.frames)
         meetings = [self.replace(way, begin.follow(way, begin.pose)) for way in ways]

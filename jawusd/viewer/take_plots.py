@@ -104,7 +104,7 @@ def solve_plot(tracks: Tracks, solved: SolvedJaw, span: tuple[int, int]) -> Plot
 
 
 def _corners(span: tuple[int, int], low: float, high: float) -> Array:
-    """Return two opposite corners (2, 2) of a plot over ranges of frames, at least one frame wide, and of values."""
+    """Return two opposite corners (2, 2) of a plot of values over frames; it is at least one frame wide."""
     return np.array([[span[0], low], [max(span[1], span[0] + 1), high]], np.float64)
 
 

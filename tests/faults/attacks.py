@@ -200,7 +200,7 @@ ATTACKS = {
     "2 ** 28 prims in 1 GB": Attack(
         partial(layer, "info", doubling(28)), ENDED, "", 1100, env=(("JAWUSD_MEMORY_GB", "1"),)
     ),
-    "layer by a link": Attack(linked, RIG, "outside its own folder"),
+    "layer by a link": Attack(linked, RIG, "outside the folder of this file"),
     "folder not UTF-8": Attack(partial(named, "a\udcff"), RIG, "not UTF-8"),
     "emoji, LC_ALL=C": Attack(partial(named, "😀"), YES, "actor", env=ASCII[:1]),
     "emoji, ASCII names": Attack(partial(named, "😀"), RIG, "set PYTHONUTF8=1", env=ASCII),

@@ -66,7 +66,7 @@ def test_errors_come_back_as_they_are(anchored_folder, tmp_path, monkeypatch):
         jawusd.load(anchored_folder, prim="/Nobody", untrusted=True)
     shutil.move(anchored_folder / "rig.usdc", tmp_path / "rig.usdc")
     (anchored_folder / "rig.usdc").symlink_to(tmp_path / "rig.usdc")
-    with pytest.raises(RigError, match="outside its own folder") as found:
+    with pytest.raises(RigError, match="outside the folder of this file") as found:
         jawusd.load(anchored_folder, untrusted=True)
     assert "--allow" in found.value.hint
     monkeypatch.setenv(SETTING, str(tmp_path))

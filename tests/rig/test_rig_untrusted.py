@@ -61,7 +61,7 @@ WAYS = ["format arguments", "dotted arguments", "expression", "clip template", "
 def test_a_shot_reads_nothing_elsewhere_but_rigs(how, anchored_folder, elsewhere):
     shot = anchored_folder / "shot.usda"
     shot.write_text(named_by(how, elsewhere))
-    with pytest.raises(RigError, match="outside its own folder"):
+    with pytest.raises(RigError, match="outside the folder of this file"):
         open_stage(shot)
 
 
@@ -71,7 +71,7 @@ def test_a_rig_reads_nothing_elsewhere(how, anchored_folder, elsewhere):
     layer = Sdf.Layer.OpenAsAnonymous(str(anchored_folder / "actor.usda"))
     layer.subLayerPaths.insert(0, "./more.usda")
     layer.Export(str(anchored_folder / "actor.usda"))
-    with pytest.raises(RigError, match="outside its own folder"):
+    with pytest.raises(RigError, match="outside the folder of this file"):
         describe(anchored_folder / "actor.usda")
 
 
@@ -83,7 +83,7 @@ def test_shots_pack_no_files_from_elsewhere(anchored_folder, elsewhere, tmp_path
         (anchored_folder / "shot.usda").write_text(f"#usda 1.0\n{text}")
         (anchored_folder / "link.png").unlink(missing_ok=True)
         (anchored_folder / "link.png").symlink_to(elsewhere / "letter.png")
-        with pytest.raises(RigError, match="outside its own folder"):
+        with pytest.raises(RigError, match="outside the folder of this file"):
             write_package(tmp_path / "shot.usdz", anchored_folder / "shot.usda")
     assert not (tmp_path / "shot.usdz").exists()
 
@@ -92,7 +92,7 @@ def test_clips_that_link_elsewhere_are_not_read(anchored_folder, elsewhere):
     (anchored_folder / "clip.1.usda").symlink_to(elsewhere / "clip.1.usda")
     text = named_by("clip template", elsewhere).replace(str(elsewhere), ".")
     (anchored_folder / "shot.usda").write_text(text)
-    with pytest.raises(RigError, match="outside its own folder"):
+    with pytest.raises(RigError, match="outside the folder of this file"):
         open_stage(anchored_folder / "shot.usda")
 
 
@@ -119,7 +119,7 @@ def test_expressions_that_another_layer_turns_elsewhere_are_not_read(anchored_fo
     shot = anchored_folder / "shot.usda"
     variables = f'expressionVariables = {{ string X = "{elsewhere}/evil.usda" }}'
     shot.write_text(f"#usda 1.0\n( {variables}\n subLayers = [@./inner.usda@] )\n")
-    with pytest.raises(RigError, match="outside its own folder"):
+    with pytest.raises(RigError, match="outside the folder of this file"):
         open_stage(shot)
 
 
@@ -157,7 +157,7 @@ def test_rigs_in_folders_that_openusd_cannot_follow_say_so(anchored_folder, tmp_
 def test_links_in_folders_named_like_packages_are_not_read(anchored_folder, elsewhere):
     (anchored_folder / "a.usdz[1]").symlink_to(elsewhere)
     (anchored_folder / "shot.usda").write_text("#usda 1.0\n( subLayers = [@./a.usdz[1]/evil.usda@] )\n")
-    with pytest.raises(RigError, match="outside its own folder"):
+    with pytest.raises(RigError, match="outside the folder of this file"):
         open_stage(anchored_folder / "shot.usda")
 
 
@@ -224,7 +224,7 @@ def test_no_path_leads_elsewhere(attack, anchored_folder, elsewhere, monkeypatch
     monkeypatch.chdir(anchored_folder)
     shot = anchored_folder / "shot.usda"
     shot.write_text(attack(anchored_folder, elsewhere))
-    with pytest.raises(RigError, match="outside its own folder"):
+    with pytest.raises(RigError, match="outside the folder of this file"):
         open_stage(shot)
 
 
@@ -245,7 +245,7 @@ def test_a_search_path_leads_to_rigs_alone(anchored_folder, tmp_path):
         command = [sys.executable, "-c", code, f"{name}.usda"]
         said[name] = subprocess.check_output(command, cwd=tmp_path / "shots", env=environment, text=True)
     assert said["rig"] == "anchored\n"
-    assert "evil.usda, which is outside its own folder and not a rig" in said["other"]
+    assert "evil.usda, which is outside the folder of this file and not a rig" in said["other"]
 
 
 def test_a_path_that_is_found_beside_the_shot_is_read(anchored_folder):
@@ -313,6 +313,6 @@ def test_templates_are_checked_before_openusd_lists_their_folders(anchored_folde
     asked = []
     monkeypatch.setattr(asset_paths.UsdUtils, "ModifyAssetPaths", lambda *_: asked.append(1))
     (anchored_folder / "shot.usda").write_text(attack_by_a_template(anchored_folder, elsewhere))
-    with pytest.raises(RigError, match="outside its own folder"):
+    with pytest.raises(RigError, match="outside the folder of this file"):
         open_stage(anchored_folder / "shot.usda")
     assert asked == []

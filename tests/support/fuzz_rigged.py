@@ -36,7 +36,7 @@ def read_rig(place, path):
             read_poses_of_stage(shown)
     except JawusdError as refusal:
         # A shot may refer to a layer elsewhere, which is opened only to find that it is not a rig.
-        if not (uses_a_rig and "outside its own folder and not a rig" in str(refusal)):
+        if not (uses_a_rig and "outside the folder of this file and not a rig" in str(refusal)):
             _check_inside(place)
         raise
     _check_inside(place)

@@ -35,7 +35,7 @@ _OFF, _MISS_MM = 0.05, 0.3
 # fraction of mask pixels off the scans that is assumed for a camera without masks in this frame, since its masks might
 # contradict the picks
 _UNSEEN = 0.25
-_SURE = 1.0  # misfit below which swapped inputs are reported without testing mistakes of single cameras
+_SURE = 1.0  # misfit below which swapped inputs are reported without testing for mistakes in single cameras
 _ALIKE = 0.15  # maximum difference of another mistake's misfit from the smallest one for it to be reported too
 # maximum number of mistakes tested: covers 15 cameras; the 6,000 mistakes of 64 cameras would take most of an hour
 _MOST_TRIED = 400

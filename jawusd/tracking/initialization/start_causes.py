@@ -135,7 +135,7 @@ _MOST_CAMERAS = 4  # maximum number of cameras for which swaps are tried, since 
 #: limit covers all mistakes of four cameras, and those of eight except swaps. Work is counted instead of time, so that
 #: messages do not depend on the machine.
 MOST_PICTURES = 120
-# Scan sizes that are tried, relative to the given size [-]; each also finds teeth that differ from it by up to 5 %.
+# Scan sizes that are tried, relative to the given size [-]; each is close enough for teeth up to 5 % larger or smaller.
 _SIZES = (0.95, 1.05, 0.86, 1.16, 0.77, 1.28)
 #: Hint for scans of a wrong size; if the size is suspected, sizes are tried first.
 SIZE_HINT = "Check the scans' unit and scaling, and the square size of the calibration board."

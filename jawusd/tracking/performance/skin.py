@@ -23,7 +23,8 @@ from jawusd.tracking.performance.system import TakeSystem
 #: the head T_world_skull, shape (F, 4, 4).
 SkinOf = Callable[[Array, Array, Mask, Array], SkinJaw]
 
-SLOW = 3  # number of unknowns per frame: the slow error in units of its standard deviation
+#: Number of unknowns per frame: components of the slowly varying error, in units of its standard deviation.
+SLOW = 3
 # Fraction of the variance that belongs to the slow error, its time constant [s], and the time over which fast errors
 # persist [s]; see docs/explanation/constants.md.
 _SHARE, _SLOW_S, _FAST_S = 0.7, 1.0, 0.04

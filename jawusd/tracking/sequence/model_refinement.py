@@ -100,7 +100,7 @@ def refine_tracks(
 
 @dataclass(frozen=True, eq=False)
 class _Refined:
-    """Poses of both arches in a frame (2, 4, 4), and the joint covariance (12, 12) of their left world twists."""
+    """Poses of both arches in a frame (2, 4, 4), and the joint covariance (12, 12) of their left twists (world)."""
 
     poses: Array
     covariance: Array

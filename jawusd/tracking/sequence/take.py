@@ -40,7 +40,7 @@ from jawusd.tracking.sequence.take_checks import (
 from jawusd.tracking.sequence.time_checks import frame_shifts, time_findings
 
 _SETTLED_REST = 6  # number of frames with closed teeth among the frames on which nuisance parameters are iterated
-# Kinds of findings that prevent the correction of camera poses, which would hide the underlying errors.
+# Kinds of findings with which camera poses are not corrected, since a correction would hide the underlying errors.
 _SHOWN_AS_MOTION = ("focal_length", "scan_size", "lens_distortion", "scans_mirrored")
 _CHECKED_FRAMES = 8  # number of frames tested for wrong lenses and scan sizes, which takes half a second
 

@@ -148,7 +148,7 @@ def _bent(name: str, bend: float, limits: LensLimits) -> Finding:
     return Finding(
         "lens_distortion",
         "warning",
-        f"this camera shows the teeth {_than(bend)} at 25 mm from the optical axis than expected by its calibration; "
+        f"this camera shows the teeth {_than(bend)} at 25 mm from the optical axis than its calibration predicts; "
         f"at most {limits.bend:.1%} is usual. Its lens distortion is wrong.",
         value=round(100 * bend, 2),
         limit=100 * limits.bend,
