@@ -54,6 +54,19 @@ def test_every_page_has_a_picture_or_an_example_and_every_guide_a_picture():
     assert [page for page, text in texts.items() if not shows_something(page, text)] == []
 
 
+def table_figures(text):
+    """Return the decimal fractions in the tables of a page."""
+    rows = "\n".join(line for line in text.splitlines() if line.startswith("|"))
+    return set(re.findall(r"(?<![\d.])\d+\.\d+(?![\d.])", rows))
+
+
+def test_figures_of_the_readme_stand_in_tables_of_the_documentation():
+    readme = table_figures((ROOT / "README.md").read_text())
+    listed = [table_figures((ROOT / page).read_text()) for page in _PAGES if page.startswith("docs/")]
+    assert len(readme) > 20 and readme - set().union(*listed) == set()
+    assert table_figures("0.5\n| a | 0.25 / 1.5 |\n") == {"0.25", "1.5"}
+
+
 @pytest.mark.parametrize(
     ("page", "text"),
     [
