@@ -130,7 +130,7 @@ def arkit_fit(
     from jawusd.pipeline.skin import read_jaw_weights
 
     refuse_existing(out, force)
-    _learn(rig, take, read_jaw_weights(face, fps), out, jaw_fps, offset, prim, as_json)
+    _learn(rig, take, read_jaw_weights(face, fps), out, jaw_fps, offset, prim, as_json, weights=True)
 
 
 def _learn(
@@ -144,11 +144,12 @@ def _learn(
     as_json: bool,
     bites: Sequence[tuple[int, int]] = (),
     head_error: tuple[float, float] = (0.0, 0.0),
+    weights: bool = False,
 ) -> None:
-    """Learn d from a face, and write and print the result."""
+    """Learn d from a face, or from its four jaw weights alone, and write and print the result."""
     import jawusd
     from jawusd.cli.animate_commands import rate_of
-    from jawusd.pipeline.skin import learn_skin, read_jaw
+    from jawusd.pipeline.skin import learn_jaw_weights, learn_skin, read_jaw
 
     loaded = jawusd.load(rig, prim=prim)
     jaw = read_jaw(loaded, take)
@@ -157,7 +158,8 @@ def _learn(
         jaw = jaw.with_bite(first, last)
     if face.fps is None:
         raise typer.BadParameter("is needed: the face capture does not state a frame rate.", param_hint="--fps")
-    skin, offset_s = learn_skin(loaded, jaw, face, offset, head_error)
+    learn = learn_jaw_weights if weights else learn_skin
+    skin, offset_s = learn(loaded, jaw, face, offset, head_error)
     jawusd.save_skin(out, skin)
     emit({"file": str(out), "offset_s": offset_s, **skin.meta}, as_json, lambda: _lines(out, skin, offset_s))
 

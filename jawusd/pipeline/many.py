@@ -245,7 +245,7 @@ def _write(root: Path, outcomes: Sequence[Outcome]) -> None:
 class _IgnoreInterrupt(WorkerPlugin):
     """Ignore signals that a terminal or service sends to all processes; the parent process handles them.
 
-    Otherwise a worker ended by such a signal would be replaced, and the build would go on.
+    Otherwise the cluster would replace a worker ended by such a signal and continue the build.
     """
 
     def setup(self, worker: Worker) -> None:

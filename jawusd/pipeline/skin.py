@@ -14,7 +14,7 @@ from jawusd.base.errors import FormatError
 from jawusd.base.tables import read_table
 from jawusd.evaluator import JawRig
 from jawusd.evaluator.skin import Skin, load_skin
-from jawusd.fitting.face import columns_at
+from jawusd.fitting.face import check_jaw_weights, columns_at
 from jawusd.fitting.skin import HEAD_ERROR, clock_offset, fit_skin
 from jawusd.formats.arkit import JAW_COLUMNS, read_arkit, read_blend_shapes
 from jawusd.formats.face_table import FaceTable, header_of, is_face_table, read_face_table
@@ -239,4 +239,22 @@ def learn_skin(
         offset_s = clock_offset(face_s, flat, times_s[jaw.seen], jaw.d[jaw.seen])
     X = columns_at(face_s + offset_s, flat, times_s).reshape(len(times_s), *face.X.shape[1:])
     skin = fit_skin(rig, X, jaw.d, jaw.seen, jaw.sigma_mm, head_error=head_error, names=face.names)
+    return skin, offset_s
+
+
+def learn_jaw_weights(
+    rig: JawRig,
+    jaw: JawTake,
+    face: FaceTable,
+    offset_s: float | None = None,
+    head_error: tuple[float, float] = (0.0, 0.0),
+) -> tuple[Skin, float]:
+    """Learn to estimate d from the four ARKit jaw weights; arguments, results and further errors as in `learn_skin`.
+
+    Raises:
+        FittingError: see `fitting.face.check_jaw_weights`.
+    """
+    skin, offset_s = learn_skin(rig, jaw, face, offset_s, head_error)
+    face_s, times_s = face.frames / (face.fps or 1.0), jaw.frames[jaw.seen] / (jaw.fps or 1.0)
+    check_jaw_weights(rig, columns_at(face_s + offset_s, face.X, times_s), jaw.d[jaw.seen], skin.errors_mm["skin"])
     return skin, offset_s

@@ -5,7 +5,7 @@ import pytest
 from face_takes import JAW_FPS, Performer
 
 from jawusd.base.errors import FittingError
-from jawusd.fitting.face import columns_at, offsets_between, refined_offset
+from jawusd.fitting.face import check_jaw_weights, columns_at, offsets_between, refined_offset
 from jawusd.fitting.skin import clock_offset, fit_skin
 from jawusd.formats.arkit import shares_of
 
@@ -52,3 +52,38 @@ def test_clocks_of_short_and_unrelated_takes_are_refused(take):
     mixed = d[np.random.default_rng(0).permutation(len(d))]
     with pytest.raises(FittingError, match="do not follow the jaw at any clock offset"):
         clock_offset(face_s, face.weights, times, mixed)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda d: d * [1, 1, 0.1], "range of movement forward"),
+        (lambda d: np.minimum(d, [99, 0.5, 99]), "range of movement to the left"),
+        (lambda d: np.maximum(d, [-99, -0.5, -99]), "range of movement to the right"),
+    ],
+)
+def test_takes_without_a_direction_are_refused(take, change, said):
+    performer, face, times, d = take
+    weights = columns_at(face.frames / face.fps, face.weights, times)
+    check_jaw_weights(performer.rig, weights, d, 0.5)
+    with pytest.raises(FittingError, match=said):
+        check_jaw_weights(performer.rig, weights, change(d), 0.5)
+
+
+def test_a_constant_weight_is_refused(take):
+    performer, face, times, d = take
+    weights = columns_at(face.frames / face.fps, face.weights, times)
+    weights[:, 3] = 0.02
+    with pytest.raises(FittingError, match="movement forward never changes"):
+        check_jaw_weights(performer.rig, weights, d, 0.5)
+
+
+def test_a_jaw_no_better_than_shares_is_refused(take):
+    """If the weights equal the shares, nothing that is learned can improve on them."""
+    rig, d = take[0].rig, take[3]
+    shares = rig.normalized(rig.project(d))
+    d = rig.denormalized(np.column_stack([shares[:, :2], np.maximum(shares[:, 2], 0)]))
+    opening, side, forward = rig.normalized(d).T
+    weights = np.stack([opening, np.maximum(side, 0), np.maximum(-side, 0), forward], axis=1)
+    with pytest.raises(FittingError, match="would not be an improvement"):
+        check_jaw_weights(rig, weights, d, 0.01)

@@ -4,29 +4,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from chin_points import NAMES, motion, skin_at
 from example_people import person
 
 import jawusd
 from jawusd.base.errors import FittingError, FormatError
-from jawusd.geometry import transform_points
 from jawusd.pipeline.solve_skin import SkinOfShot
 from jawusd.pipeline.solve_videos import SkinOptions
 
 FPS, FACE_FPS, LATE_S = 25.0, 30.0, 0.42  # the face starts 0.42 s after frame 0 of the shot
-NAMES = ("chin", "left", "right", "lip")
-
-
-def skin_at(rig, d, rng):
-    """Return points (F, 4, 3) that follow three quarters of the bone's motion."""
-    points = rig.landmarks[0] + np.array([[0, -30, 5], [12, -28, 0], [-12, -28, 0], [0, -5, 8]])
-    rest, moved = (transform_points(T, points) for T in (rig.T_rest, rig.pose(d)))
-    return rest + 0.75 * (moved - rest) + rng.normal(0, 0.15, (len(d), 4, 3))
-
-
-def motion(times):
-    """Return d (F, 3) [mm] at times [s]."""
-    opening = 9 + 4 * np.sin(2.1 * times) + 2 * np.sin(5.3 * times)
-    return np.column_stack([opening, 1.5 * np.sin(3.1 * times), 0.8 + 0.5 * np.cos(2.7 * times)])
 
 
 def write_face(path, X):

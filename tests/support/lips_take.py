@@ -111,7 +111,7 @@ def write_lips_capture(folder, seed, frames=100, size_px=(640, 360)):
         "landmark_names": np.array(LANDMARKS), "landmarks": person.landmarks,
     }  # fmt: skip
     write_npz_atomic(folder / "truth" / "truth.npz", truth)
-    write_text_atomic(folder / "capture.toml", _description(seed, frames, cameras, picks))
+    write_text_atomic(folder / "capture.toml", described(f"lips_{seed}", FPS, frames, cameras, picks))
     return folder / "capture.toml"
 
 
@@ -127,9 +127,10 @@ def _bare_px(arches, poses, camera):
     return _SHARE_STEP**2 * np.array([(labels == 1).sum(), (labels == 2).sum()], float)
 
 
-def _description(seed, frames, cameras, picks):
+def described(name, fps, frames, cameras, picks=None):
+    """Return the capture.toml of synchronous videos without masks; picks of both arches are in frame 0."""
     lines = [
-        'format = "jawusd-capture/1"', f'name = "lips_{seed}"', 'units = "mm"', f"fps = {FPS}",
+        'format = "jawusd-capture/1"', f'name = "{name}"', 'units = "mm"', f"fps = {fps}",
         'calibration = "calibration.toml"', f"frames = [0, {frames}]", "",
         "[scans]", *(f'{jaw}_teeth = "scans/{jaw}_teeth.ply"' for jaw in ROWS), "",
     ]  # fmt: skip
@@ -137,8 +138,9 @@ def _description(seed, frames, cameras, picks):
         lines += ["[[camera]]", f'name = "{camera.name}"', f'video = "video/{camera.name}.mp4"', ""]
     offsets = ", ".join(f"{camera.name} = 0" for camera in cameras)
     lines += ["[sync]", 'method = "offsets"', 'reference = "cam0"', f"offsets = {{ {offsets} }}", ""]
-    lines += ["[bootstrap]", "frame = 0", ""]
-    for jaw, own in zip(ROWS, picks):
+    if picks is not None:
+        lines += ["[bootstrap]", "frame = 0", ""]
+    for jaw, own in zip(ROWS, picks or ((), ())):
         for pick in own:
             views = ", ".join(f'{{ camera = "{name}", x = {x:.2f}, y = {y:.2f} }}' for name, x, y in pick.views)
             lines += [f"[[bootstrap.{jaw}]]", f"vertex = {pick.vertex}", f"views = [{views}]", ""]

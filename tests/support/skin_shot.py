@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from lips_take import ROWS, closed_lips
+from lips_take import ROWS, closed_lips, described
 from subjects.scanner import Scanner, encoded
 
 from jawusd.cameras.calibration import save_calibration
@@ -117,18 +117,5 @@ def write_skin_shot(folder, seed, frames=260, size_px=(480, 360), closings=((110
         "landmark_names": np.array(LANDMARKS), "landmarks": person.landmarks,
     }  # fmt: skip
     write_npz_atomic(folder / "truth" / "truth.npz", truth)
-    write_text_atomic(folder / "capture.toml", _description(seed, frames, cameras))
+    write_text_atomic(folder / "capture.toml", described(f"skin_{seed}", FPS, frames, cameras))
     return folder / "capture.toml"
-
-
-def _description(seed, frames, cameras):
-    lines = [
-        'format = "jawusd-capture/1"', f'name = "skin_{seed}"', 'units = "mm"', f"fps = {FPS}",
-        'calibration = "calibration.toml"', f"frames = [0, {frames}]", "",
-        "[scans]", *(f'{jaw}_teeth = "scans/{jaw}_teeth.ply"' for jaw in ROWS), "",
-    ]  # fmt: skip
-    for camera in cameras:
-        lines += ["[[camera]]", f'name = "{camera.name}"', f'video = "video/{camera.name}.mp4"', ""]
-    offsets = ", ".join(f"{camera.name} = 0" for camera in cameras)
-    lines += ["[sync]", 'method = "offsets"', 'reference = "cam0"', f"offsets = {{ {offsets} }}", ""]
-    return "\n".join(lines)

@@ -183,7 +183,7 @@ def test_skin_measures_the_jaw_while_one_camera_sees_no_teeth(jaw, scans, truth,
 
     carried, found = (solved(jaw, scans, truth, tmp_path, small_take.CAMERAS[:1], skin=s) for s in (None, skin))
     without, errors = (tip_error_mm(jaw, one, truth)[usual].mean() for one in (carried, found))
-    assert errors < 0.4 < 1.0 < without
+    assert errors < 0.35 < 1.0 < without, errors
     z2 = ((found.d - truth[0]) ** 2 / found.sigma_d**2)[hidden].mean()
     assert 0.1 < z2 < 2.0 and (found.sigma_d[usual] < 0.6 * carried.sigma_d[usual]).all()
     assert found.sigma_d[strange].min() > 2 * found.sigma_d[usual].max()
