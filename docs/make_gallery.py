@@ -252,11 +252,11 @@ def footage(out: Path, folder: Path) -> Path:
 def viewer(out: Path, folder: Path) -> Path:
     """Photograph the page of `jawusd view` at a frame of the take, with its footage."""
     with viewed(out, (1440, 900)) as (served, page):
-        actor = viewed_actor(out)
-        served.show(actor.load_clip(actor.take).at(VIEWED_FRAME))
         (shown,) = served.pages.values()
+        page.get_by_role("button", name="play", exact=True).click()
+        page.get_by_role("button", name="pause", exact=True).click()
         shown.motion.show(float(VIEWED_FRAME))
-        if actor.footage is not None:
+        if shown.footage is not None:
             page.wait_for_selector("img:visible")
         page.wait_for_timeout(4000)  # jaw and footage are drawn
         picture = page.screenshot()

@@ -34,9 +34,8 @@ class Playback:
         self._line = client.gui.add_html("")
         self.button = client.gui.add_button("play", icon=viser.Icon.PLAYER_PLAY)
 
-    def show(self, motion: str, frame: float, span: tuple[float, float] | None) -> None:
-        """Show the motion's name, its current frame, and its first and last frame (None if it has no frames)."""
-        where = "nothing to play" if span is None else f"frame {frame:.0f} of {span[0]:.0f} to {span[1]:.0f}"
+    def show(self, motion: str, where: str) -> None:
+        """Show the motion's name, and its current frame or why it has none."""
         self._line.content = small_text(f"{html.escape(motion)}, {where}", "padding-top:6px")
 
     def show_playing(self, playing: bool) -> None:
@@ -82,6 +81,7 @@ class MotionPanel:
         self.fps.on_update(guarded(client, self._rate))
         self._plot: Plot = curve_plot(None, (), (0.0, float(_LENGTH)))
         self.frame = 0.0
+        self._reading = False  # whether the take is being read
 
     def clip(self) -> Clip | None:
         """Return the selected motion; None if it has no keys, or while its file is being read."""
@@ -124,8 +124,18 @@ class MotionPanel:
         svg = with_playhead(plot, self.frame)
         self._playhead.content = plot_seek(svg, ends, plot.across, self.frame_slider._impl.uuid)
         assign(self.frame_slider, float(round(self.frame)))
-        clip = self.clip()
-        self._playback.show(chosen, self.frame, None if clip is None else clip.span)
+        self._playback.show(*self._where())
+
+    def _where(self) -> tuple[str, str]:
+        """Return the motion that the play button plays, and its current frame or why it has none."""
+        clip, chosen, take = self.clip(), self.source.value, self._actor.take
+        if clip is not None:
+            return chosen, f"frame {self.frame:.0f} of {clip.span[0]:.0f} to {clip.span[1]:.0f}"
+        if chosen != KEYS:
+            return chosen, "being read"
+        if take is None:
+            return chosen, "nothing to play"
+        return take, "being read" if self._reading else "ready to play"
 
     def _set_ends(self, clip: Clip | None) -> tuple[float, float]:
         """Set the range of the timeline to a motion; return its first and last frame."""
@@ -148,14 +158,20 @@ class MotionPanel:
     async def play_take(self) -> None:
         """Play the captured take, if there is one, unless the visitor used the page while the take was being read."""
         take, source, work = self._actor.take, self.source.value, self._session.work
-        if take is None:
+        if take is None or self._reading:
             return
-        with errors_shown(self._client):
-            clip = self._loaded[take] = await asyncio.to_thread(self._actor.load_clip, take)
-            if self.source.value == source and self._session.work is work:
-                assign(self.source, take)
-                self._begin(clip)
-                self._start(clip)
+        self._reading = True
+        self._changed()
+        try:
+            with errors_shown(self._client):
+                clip = self._loaded[take] = await asyncio.to_thread(self._actor.load_clip, take)
+                if self.source.value == source and self._session.work is work:
+                    assign(self.source, take)
+                    self._begin(clip)
+                    self._start(clip)
+        finally:
+            self._reading = False
+        self._changed()
 
     async def _choose(self, _: object) -> None:
         self.player.stop()
@@ -185,9 +201,12 @@ class MotionPanel:
             self.player.stop()
             return
         clip = self.clip()
-        if clip is None:
+        if clip is not None:
+            self._start(clip)
+        elif self.source.value == KEYS and self._actor.take is not None:
+            await self.play_take()
+        else:
             raise FormatError("there is nothing to play.", hint="Set keys, or select another motion.")
-        self._start(clip)
 
     def _start(self, clip: Clip) -> None:
         self._playback.show_playing(True)

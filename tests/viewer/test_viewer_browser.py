@@ -270,8 +270,7 @@ def test_three_keys_are_exported_saved_and_loaded_again(tab, folder, tmp_path):
 
 def test_the_baked_motion_plays_goes_round_and_stops(tab):
     tab.tab("Animate")
-    tab.press("play")
-    tab.said("there is nothing to play")
+    tab.said("anim_capture.usdc, ready to play")
     tab.web.locator("input[role=combobox]:visible").first.click()
     tab.web.get_by_role("option", name=tab.page.motion.source.options[1]).click()
     motion = tab.page.motion

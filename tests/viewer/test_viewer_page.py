@@ -185,8 +185,6 @@ def test_keys_are_set_moved_exported_saved_and_loaded(quiet, folder, tmp_path):
 
 def test_a_baked_motion_is_chosen_played_round_and_stopped(quiet):
     motion, session = quiet.page.motion, quiet.page.session
-    quiet.enter(motion.play, True)
-    assert "nothing to play" in quiet.notices.pop()[1]
     quiet.enter(motion.source, motion.source.options[1])
     clip = motion.clip()
     np.testing.assert_allclose(session.d, clip.d[0], atol=1e-9)
@@ -204,13 +202,41 @@ def test_a_baked_motion_is_chosen_played_round_and_stopped(quiet):
 
 
 def frame_said(quiet):
-    """Return the motion and the frame that a page names."""
-    return re.search(r">([^>]+), (?:frame (\d+) of \d+ to \d+|nothing to play)<", quiet.page.playback._line.content)
+    """Return the motion and the frame that a page names, and what it says instead of a frame."""
+    words = r">([^>]+), (?:frame (\d+) of \d+ to \d+|(nothing to play|ready to play|being read))<"
+    return re.search(words, quiet.page.playback._line.content)
+
+
+def test_the_play_button_plays_the_take_until_there_are_keys(quiet):
+    motion = quiet.page.motion
+    assert frame_said(quiet).groups() == ("anim_capture.usdc", None, "ready to play")
+    read = threading.Event()
+    load = motion._actor.load_clip
+    motion._actor = dataclasses.replace(motion._actor, load_clip=lambda name: read.wait(60) and load(name))
+    pressed = threading.Thread(target=quiet.enter, args=(motion.play, True))
+    pressed.start()
+    until(lambda: frame_said(quiet)[3] == "being read")
+    read.set()
+    pressed.join()
+    assert motion.player.playing and motion.source.value == "anim_capture.usdc" and quiet.notices == []
+    quiet.enter(motion.play, True)
+    quiet.enter(motion.source, "keys")
+    quiet.enter(button(quiet, "keys"), "set")
+    assert frame_said(quiet)[1] == "keys" and frame_said(quiet)[2] is not None
+
+
+def test_without_a_take_and_without_keys_there_is_nothing_to_play(quiet):
+    motion = quiet.page.motion
+    motion._actor = dataclasses.replace(motion._actor, take=None)
+    quiet.call(quiet.page.refresh)
+    assert frame_said(quiet).groups() == ("keys", None, "nothing to play")
+    quiet.enter(motion.play, True)
+    assert "nothing to play" in quiet.notices.pop()[1] and not motion.player.playing
 
 
 def test_the_captured_take_plays_as_the_page_opens_until_it_is_paused(quiet):
     motion, session = quiet.page.motion, quiet.page.session
-    assert frame_said(quiet)[1] == "keys" and frame_said(quiet)[2] is None
+    assert frame_said(quiet)[2] is None
     quiet.call(quiet.page.play_take)
     until(lambda: motion.player.playing)
     clip = motion.clip()
