@@ -21,7 +21,7 @@ from jawusd.formats.mesh import Mesh, crown_face_mask
 from jawusd.formats.model import load_model
 from jawusd.formats.tracks import load_tracks
 from jawusd.geometry import transform_point, transform_points
-from jawusd.geometry.quaternion import continuous_wxyz, matrix_from_wxyz
+from jawusd.geometry.so3 import continuous_wxyz, matrix_from_wxyz
 from jawusd.pipeline.bake import SHAPES
 from jawusd.pipeline.library import open_library
 from jawusd.report.figures import ranges_figure

@@ -1,6 +1,6 @@
 """The compiled form of each kind of model: its part of the packed model, its motion and derivatives, for one d.
 
-See `jawusd.evaluator.models`. `model` is the array from `motion.packed_model`, `w` the scratch memory of one call.
+See `jawusd.evaluator.models`. `model` is the array from `kernels.packed_model`, `w` the scratch memory of one call.
 """
 
 from __future__ import annotations

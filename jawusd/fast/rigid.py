@@ -1,11 +1,13 @@
-"""Compiled rotations, rigid motions and small linear algebra, one item at a time."""
+"""Decorators that compile functions, and compiled rotations, rigid motions and small linear algebra, one at a time."""
 
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable
+from functools import partial
 from math import cos, sqrt, tan
-from typing import cast
+from typing import TypeVar, cast
 
 import numba
 from numba.extending import register_jitable
@@ -15,6 +17,42 @@ from jawusd.evaluator import gauge
 from jawusd.evaluator.gauge import Elementary
 from jawusd.geometry import rodrigues
 from jawusd.geometry.rodrigues import angle_coefficients, apply_series, dot, turning
+
+F = TypeVar("F")
+
+_in_memory = partial(numba.njit, nogil=True, error_model="numpy")
+_cacheable: list[bool] = []  # whether machine code can be cached on disk; empty until the first function is compiled
+
+
+def compiled(signature: str) -> Callable[[F], F]:
+    """Return a decorator that compiles a function for the argument types of a signature.
+
+    Without a writable cache folder the code is kept in memory only, and one RuntimeWarning is issued.
+    """
+
+    def compile_function(function: F) -> F:
+        if not _cacheable or _cacheable[0]:
+            try:
+                made = cast("F", _in_memory(signature, cache=True)(function))
+            except (OSError, RuntimeError) as error:  # no cache folder is writable, or the disk is full
+                _cacheable[:] = [False]
+                _warn(error)
+            else:
+                _cacheable[:] = [True]
+                return made
+        return cast("F", _in_memory(signature)(function))
+
+    return compile_function
+
+
+def _warn(error: Exception) -> None:
+    warnings.warn(
+        f"jawusd.fast cannot cache its compiled code on disk ({error}): every process compiles for some 20 seconds. "
+        "Set NUMBA_CACHE_DIR to a writable folder.",
+        RuntimeWarning,
+        stacklevel=4,
+    )
+
 
 Vector = tuple[float, float, float]
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from jawusd.base.arrays import Array
 from jawusd.formats.atomic import write_bytes_atomic
-from jawusd.geometry.quaternion import continuous_wxyz
+from jawusd.geometry.so3 import continuous_wxyz
 
 _MM = 1e-3  # one millimetre in metres
 _FLOAT, _UINT16, _UINT32 = 5126, 5123, 5125

@@ -29,7 +29,7 @@ from jawusd.base.tables import TextTable, read_table, read_text
 from jawusd.formats.atomic import write_text_atomic
 from jawusd.formats.text import parse_json
 from jawusd.geometry import make_transform, matrix_from_wxyz, rigidity_defect
-from jawusd.geometry.quaternion import wxyz_from_matrix
+from jawusd.geometry.so3 import wxyz_from_matrix
 
 MATRIX_COLUMNS = tuple(f"m{row}{column}" for row in range(4) for column in range(4))
 QUATERNION_COLUMNS = ("tx", "ty", "tz", "qw", "qx", "qy", "qz")

@@ -18,8 +18,7 @@ from jawusd.geometry.anatomy import (
     mandible_metric,
 )
 from jawusd.geometry.camera import Camera
-from jawusd.geometry.quaternion import matrix_from_wxyz, wxyz_from_matrix
-from jawusd.geometry.rigid import rigid_fit, rigid_fits, triangulate
+from jawusd.geometry.points import rigid_fit, rigid_fits, triangulate
 from jawusd.geometry.se3 import (
     make_transform,
     orthonormalise,
@@ -37,6 +36,7 @@ from jawusd.geometry.se3 import (
 )
 from jawusd.geometry.so3 import (
     hat,
+    matrix_from_wxyz,
     random_rotation,
     so3_exp,
     so3_left_jacobian,
@@ -44,6 +44,7 @@ from jawusd.geometry.so3 import (
     so3_log,
     so3_right_jacobian,
     vee,
+    wxyz_from_matrix,
 )
 
 __all__ = [

@@ -1,11 +1,110 @@
-"""Point sets and triangles: matching to a rigidly moved copy, welding of coincident points, ray intersection."""
+"""Point sets and triangles: alignment, matching to a moved copy, triangulation, welding, and ray intersection."""
 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from jawusd.base.arrays import Array
+from jawusd.geometry.se3 import make_transform, transform_points
+
+_MIN_ASPECT = 1e-6  # ratio of the second-largest to the largest extent of points below which they count as collinear
+
+
+def rigid_fit(source: ArrayLike, target: ArrayLike, weights: ArrayLike | None = None) -> Array:
+    """Return the rigid T (..., 4, 4) minimising sum w |T source - target|^2 (Arun et al. 1987, Umeyama 1991).
+
+    Args:
+        source: Points [mm], shape (N, 3), N >= 3, not collinear.
+        target: points [mm], one set or many, shape (..., N, 3).
+        weights: non-negative, shape (N,).
+
+    Raises:
+        ValueError: the shapes are wrong, or the points are fewer than three or collinear.
+    """
+    P, Q = np.asarray(source, dtype=np.float64), np.asarray(target, dtype=np.float64)
+    if P.shape != Q.shape[-2:] or P.ndim != 2 or P.shape[1] != 3 or len(P) < 3:
+        raise ValueError(f"source and target must both have shape (N >= 3, 3), got {P.shape} and {Q.shape}")
+    w = np.ones(len(P)) if weights is None else np.asarray(weights, dtype=np.float64)
+    w = w / w.sum()
+    p0, q0 = w @ P, w @ Q
+    spread = np.linalg.svd((P - p0) * np.sqrt(w)[:, None], compute_uv=False)
+    if spread[1] < 1e-9 * max(spread[0], 1e-300):
+        raise ValueError("the source points are collinear, so the rotation about their line is undetermined")
+    U, _, Vt = np.linalg.svd(((P - p0) * w[:, None]).T @ (Q - q0[..., None, :]))
+    sign = np.ones((*U.shape[:-2], 1, 3))
+    sign[..., 0, 2] = np.sign(np.linalg.det(U @ Vt))
+    R = np.swapaxes((U * sign) @ Vt, -1, -2)
+    return make_transform(R, q0 - R @ p0)
+
+
+def rigid_fits(source: ArrayLike, targets: ArrayLike) -> tuple[Array, Array]:
+    """Return the rigid motions of a point set in frames with missing points, each by `rigid_fit`.
+
+    Args:
+        source: points [mm], shape (N, 3).
+        targets: The points after each motion [mm], shape (F, N, 3), NaN if missing.
+
+    Returns:
+        T (F, 4, 4), and the rms distance (F,) [mm] over the points present; both NaN in frames with fewer than three
+        points or collinear ones.
+
+    Raises:
+        ValueError: the shapes are wrong.
+    """
+    P, Q = np.asarray(source, dtype=np.float64), np.asarray(targets, dtype=np.float64)
+    if P.ndim != 2 or P.shape[1] != 3 or Q.ndim != 3 or Q.shape[1:] != P.shape:
+        raise ValueError(f"expected source (N, 3) and targets (F, N, 3), got {P.shape} and {Q.shape}")
+    T, rms = np.full((len(Q), 4, 4), np.nan), np.full(len(Q), np.nan)
+    present = np.isfinite(Q).all(axis=-1)
+    for seen in np.unique(present, axis=0):
+        if seen.sum() < 3 or _on_a_line(P[seen]):
+            continue
+        rows = np.flatnonzero((present == seen).all(axis=1))
+        found = Q[rows][:, seen]
+        T[rows] = rigid_fit(P[seen], found)
+        off = transform_points(T[rows], P[seen]) - found
+        rms[rows] = np.sqrt((off**2).sum(axis=-1).mean(axis=-1))
+    return T, rms
+
+
+def _on_a_line(points: Array) -> bool:
+    spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+    return bool(spread[1] < _MIN_ASPECT * spread[0] or spread[0] == 0)
+
+
+def triangulate(projections: ArrayLike, pixels: ArrayLike) -> Array:
+    """Return the world point (3,) [mm] that projects to the given pixels.
+
+    A linear estimate (Hartley & Zisserman, Multiple View Geometry, section 12.2), refined by Gauss-Newton on
+    the reprojection error.
+
+    Args:
+        projections: pinhole projection matrices (world mm -> px), shape (C, 3, 4), C >= 2.
+        pixels: undistorted image points [px], shape (C, 2).
+
+    Raises:
+        ValueError: the shapes are wrong, or there are fewer than two views.
+    """
+    M, x = np.asarray(projections, dtype=np.float64), np.asarray(pixels, dtype=np.float64)
+    if M.ndim != 3 or M.shape[1:] != (3, 4) or x.shape != (len(M), 2) or len(M) < 2:
+        raise ValueError(f"expected projections (C >= 2, 3, 4) and pixels (C, 2), got {M.shape} and {x.shape}")
+    rows = (x[:, :, None] * M[:, None, 2, :] - M[:, :2, :]).reshape(-1, 4)
+    rows = rows / np.linalg.norm(rows, axis=1, keepdims=True)
+    X = np.linalg.svd(rows)[2][-1]
+    X = X[:3] / X[3]
+    for _ in range(10):
+        h = M @ np.append(X, 1.0)
+        seen = h[:, :2] / h[:, 2:]
+        residual = (seen - x).ravel()
+        J = (M[:, :2, :3] - seen[:, :, None] * M[:, None, 2, :3]) / h[:, 2, None, None]
+        J = J.reshape(-1, 3)
+        step = np.linalg.lstsq(J, residual, rcond=None)[0]
+        X = X - step
+        if np.linalg.norm(step) < 1e-10:
+            break
+    return X
+
 
 _HALF_TURNS = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
 _PROBES = 60

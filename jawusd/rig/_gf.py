@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pxr import Gf, Vt
 
-from jawusd.geometry.quaternion import continuous_wxyz
+from jawusd.geometry.so3 import continuous_wxyz
 
 
 def double_array(values: ArrayLike) -> Vt.DoubleArray:

@@ -18,9 +18,8 @@ from pxr import Gf, Sdf, Ts
 from jawusd.base.arrays import Array, Mask
 from jawusd.base.errors import RigError
 from jawusd.evaluator import JawRig
-from jawusd.geometry.quaternion import wxyz_from_matrix
 from jawusd.geometry.se3 import make_transform
-from jawusd.geometry.so3 import so3_exp
+from jawusd.geometry.so3 import so3_exp, wxyz_from_matrix
 from jawusd.rig import _gf
 from jawusd.rig.layers import new_layer, relative_path, rename_actor, stage_of, write_layer
 from jawusd.rig.layout import ACTOR, MANDIBLE, MODEL_HASH_KEY, PARAMETERS, rig_prims

@@ -16,8 +16,7 @@ from pxr import Sdf, Usd, UsdGeom, UsdSkel, Vt
 from jawusd.base.arrays import Array
 from jawusd.base.errors import FormatError
 from jawusd.formats.mesh import Mesh
-from jawusd.geometry.points import match_points
-from jawusd.geometry.rigid import rigid_fit
+from jawusd.geometry.points import match_points, rigid_fit
 from jawusd.geometry.se3 import se3_inverse, transform_points
 from jawusd.rig.attributes import value_of
 from jawusd.rig.geo import read_geometry

@@ -18,8 +18,7 @@ from jawusd.solvers.charts import chart_of
 from jawusd.solvers.encoding import encoded
 from jawusd.solvers.hull import Hull
 from jawusd.solvers.interior import Interior
-from jawusd.solvers.precision import check_precision, full_precision
-from jawusd.solvers.solution import attached, solved
+from jawusd.solvers.solution import attached, check_precision, full_precision, solved
 
 _CORNERS = [(i, j, k) for i in (0, 1) for j in (0, 1) for k in (0, 1)]
 

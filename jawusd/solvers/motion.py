@@ -18,7 +18,7 @@ from jawusd.evaluator.formula import Numbers, RigidMotion, anchored_motion
 from jawusd.evaluator.kinds import MODELS
 from jawusd.evaluator.operations import Rows, polynomial, triple
 from jawusd.geometry.rodrigues import SMALL_SQUARED_ANGLE, Triple, angle_quotients, angle_series
-from jawusd.solvers.precision import check_precision, full_precision
+from jawusd.solvers.solution import check_precision, full_precision
 
 _TINY = 1e-30  # added to the argument of sqrt, which keeps the derivative at zero finite
 

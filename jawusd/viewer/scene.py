@@ -10,8 +10,8 @@ import viser
 from jawusd.base.arrays import Array
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry import LANDMARKS
-from jawusd.geometry.quaternion import wxyz_from_matrix
 from jawusd.geometry.se3 import se3_inverse, transform_point, transform_points
+from jawusd.geometry.so3 import wxyz_from_matrix
 from jawusd.viewer.readouts import CONDYLES, INCISOR, captured_d, habitual_path, landmark_places, rest_places
 from jawusd.viewer.viewed import MOVING, STILL, ViewedActor, is_solid
 

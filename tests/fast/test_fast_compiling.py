@@ -7,7 +7,7 @@ from pathlib import Path
 
 import jawusd
 
-MODULE = Path(jawusd.__file__).parent / "fast" / "compiling.py"
+MODULE = Path(jawusd.__file__).parent / "fast" / "rigid.py"
 CODE = """
 import runpy, sys
 compiled = runpy.run_path(sys.argv[1])["compiled"]  # the package around it would compile for long
