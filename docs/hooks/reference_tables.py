@@ -8,8 +8,7 @@ from reference_commands import escaped
 
 import jawusd.base.errors
 from jawusd.cli.commands import EXIT_CODES
-from jawusd.evaluator.kinds import every_array
-from jawusd.evaluator.schema import D_RANGE_ATTRIBUTES
+from jawusd.evaluator.kinds import D_RANGE_ATTRIBUTES, every_array
 from jawusd.formats.capture import capture_keys
 
 SCHEMA = Path(__file__).resolve().parents[2] / "schemas" / "schema.usda"

@@ -9,19 +9,32 @@ from __future__ import annotations
 
 import os
 import re
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 
 from jawusd.base.arrays import Array
 from jawusd.base.errors import CalibrationError
-from jawusd.cameras.parts import check_lens_model
+from jawusd.cameras.files import CameraFormat, Size, check_lens_model
 from jawusd.formats.atomic import write_text_atomic
 from jawusd.formats.text import read_toml
 from jawusd.geometry import Camera, make_transform, rigidity_defect, so3_exp, so3_log
 
 # Maximum entry of R R^T - I for a rotation to be accepted; rotations written with 6 digits stay below it.
 _ROTATION_TOLERANCE = 1e-4
+_NOT_READ = {
+    ".3de": "3DEqualizer's project",
+    ".mel": "MEL",
+    ".ma": "Maya",
+    ".mb": "Maya",
+    ".fbx": "FBX",
+    ".chan": "curves",
+    ".bin": "a binary model of COLMAP",
+    ".npz": "numpy",
+    ".mat": "MATLAB",
+}
+_INSTEAD = "Export the cameras for Nuke (.nk, from 3DEqualizer) or as USD; `jawusd cameras -h` lists all formats."
 _CAMERA_TABLE = re.compile(r"^cam_\d+$")
 
 
@@ -118,3 +131,15 @@ def save_calibration(path: str | os.PathLike[str], cameras: list[Camera]) -> Non
             "",
         ]
     write_text_atomic(path, "\n".join([*lines, "[metadata]", 'units = "mm"', ""]))
+
+
+def _load(path: Path, _: Mapping[str, Size]) -> list[Camera]:
+    if path.is_dir():
+        raise CalibrationError("is a folder without cameras in a supported format.", path=path, hint=_INSTEAD)
+    if path.suffix.lower() in _NOT_READ:
+        what = _NOT_READ[path.suffix.lower()]
+        raise CalibrationError(f"is a file of {what}; this format is not supported.", path=path, hint=_INSTEAD)
+    return load_calibration(path)
+
+
+FORMAT = CameraFormat(lambda path: 0, _load)  # of all files that no other format reads

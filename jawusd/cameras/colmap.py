@@ -17,7 +17,7 @@ import numpy as np
 from jawusd.base.arrays import Array
 from jawusd.base.errors import CalibrationError, FormatError, OutputError
 from jawusd.base.tables import read_text
-from jawusd.cameras.parts import MOST_BYTES, CameraFormat, cameras_of_images, corner_matrix, files_in
+from jawusd.cameras.files import MOST_BYTES, CameraFormat, cameras_of_images, corner_matrix, files_in
 from jawusd.formats.atomic import write_text_atomic
 from jawusd.geometry import Camera, make_transform, matrix_from_wxyz, wxyz_from_matrix
 

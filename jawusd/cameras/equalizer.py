@@ -20,8 +20,8 @@ import numpy as np
 from jawusd.base.arrays import Array
 from jawusd.base.errors import CalibrationError
 from jawusd.cameras.equalizer_lens import FoundLens, Lens, find_lenses, opencv_of
+from jawusd.cameras.files import CameraFormat, Size, files_in, known_size
 from jawusd.cameras.nuke_script import SAME, NukeNode, knob_values, read_nuke_script, steady_values
-from jawusd.cameras.parts import CameraFormat, Size, files_in, known_size
 from jawusd.geometry import Camera, make_transform, se3_inverse, so3_exp
 
 _OPENGL = np.diag([1.0, -1.0, -1.0])

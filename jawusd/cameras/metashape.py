@@ -19,7 +19,7 @@ import numpy as np
 
 from jawusd.base.arrays import Array
 from jawusd.base.errors import CalibrationError
-from jawusd.cameras.parts import (
+from jawusd.cameras.files import (
     UNDISTORT,
     CameraFormat,
     Size,

@@ -14,7 +14,7 @@ import numpy as np
 from jawusd.base.arrays import Array
 from jawusd.base.errors import CalibrationError, FormatError
 from jawusd.base.tables import read_text
-from jawusd.cameras.parts import MOST_BYTES, UNDISTORT, CameraFormat, cameras_of_images, corner_matrix
+from jawusd.cameras.files import MOST_BYTES, UNDISTORT, CameraFormat, cameras_of_images, corner_matrix
 from jawusd.formats.text import parse_json
 from jawusd.geometry import Camera, rigidity_defect, se3_inverse
 

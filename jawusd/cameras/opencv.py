@@ -18,7 +18,7 @@ import numpy as np
 from jawusd.base.arrays import Array
 from jawusd.base.errors import CalibrationError
 from jawusd.base.tables import read_text
-from jawusd.cameras.parts import CameraFormat, Size, check_lens_model, files_in, parsed_xml, plain_name
+from jawusd.cameras.files import CameraFormat, Size, check_lens_model, files_in, parsed_xml, plain_name
 from jawusd.formats.text import parse_json
 from jawusd.geometry import Camera, make_transform, rigidity_defect, so3_exp
 

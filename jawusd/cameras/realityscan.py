@@ -23,7 +23,7 @@ import numpy as np
 from jawusd.base.arrays import Array
 from jawusd.base.errors import CalibrationError
 from jawusd.base.tables import read_table
-from jawusd.cameras.parts import (
+from jawusd.cameras.files import (
     CameraFormat,
     Size,
     files_in,

@@ -14,8 +14,8 @@ from jawusd.base.arrays import Array
 from jawusd.base.errors import CalibrationError, CaptureError
 from jawusd.formats.capture import Boards
 from jawusd.formats.file_names import is_pattern, numbered_files
-from jawusd.media.display import to_display
 from jawusd.media.pictures import read_header, read_picture, read_stored
+from jawusd.media.pixels import to_display
 from jawusd.media.video import Video
 
 Search = Callable[[NDArray[np.uint8]], Array | None]

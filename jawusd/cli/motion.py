@@ -14,9 +14,9 @@ from jawusd.base.errors import FormatError, naming_file
 from jawusd.base.inputs import check_input
 from jawusd.cli.options import USD_SUFFIXES
 from jawusd.cli.output import emit
+from jawusd.evaluator.authoring import monotone_tangents
 from jawusd.evaluator.clamping import Inside
 from jawusd.evaluator.curves import HermiteCurve
-from jawusd.evaluator.interpolation import monotone_tangents
 from jawusd.formats.keys import FARTHEST_FRAME, FARTHEST_MM, MOST_FRAMES, Key, Keys, load_keys
 from jawusd.formats.poses import read_poses, read_poses_or_parameters
 from jawusd.formats.tracks import load_tracks

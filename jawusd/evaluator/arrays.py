@@ -12,8 +12,7 @@ from numpy.typing import ArrayLike
 from jawusd.base.arrays import Array
 from jawusd.base.errors import EvaluatorError
 from jawusd.evaluator.contact import PREFIXES, check_contact
-from jawusd.evaluator.kinds import KINDS, arrays_of, optional_of
-from jawusd.evaluator.schema import ArraySpec
+from jawusd.evaluator.kinds import KINDS, ArraySpec, arrays_of, optional_of
 from jawusd.evaluator.speeds import check_speeds
 from jawusd.geometry.anatomy import LANDMARKS
 from jawusd.geometry.se3 import rigidity_defect

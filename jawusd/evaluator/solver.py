@@ -47,14 +47,7 @@ class Bound(Protocol):
         """Return signed distance (n,), gradient (n, 3) and positive semidefinite curvature (n, 3, 3)."""
 
 
-def minimise(
-    residual: Residual,
-    start: Array,
-    bound: Bound | None = None,
-    *,
-    iterations: int = ITERATIONS,
-    tolerance_mm: float = TOLERANCE_MM,
-) -> Array:
+def minimise(residual: Residual, start: Array, bound: Bound | None = None) -> Array:
     """Minimise half the squared residual of every row.
 
     Args:
@@ -62,8 +55,6 @@ def minimise(
         start: Initial points [mm], shape (n, 3), inside the bound if given. Rows with a NaN start or residual become
             NaN.
         bound: The bound that points must stay inside.
-        iterations: Maximum number of steps per row.
-        tolerance_mm: Step length below which a row has converged.
 
     Returns:
         The points [mm], shape (n, 3).
@@ -79,12 +70,12 @@ def minimise(
     r, J = _picked(measured, r, J)
     damping = np.full(len(rows), START_DAMPING)
     multiplier = np.zeros(len(rows)) if bound is None else _first_multiplier(bound, x[rows], r, J)
-    for _ in range(iterations):
+    for _ in range(ITERATIONS):
         if bound is None:
             step = -solve_symmetric(_damped(np.swapaxes(J, 1, 2) @ J, damping), _gradient(J, r))
         else:
             step, multiplier = _bounded_step(bound, x[rows], r, J, damping, multiplier)
-        moving = (np.abs(step) > tolerance_mm).any(axis=1) & (damping < MAX_DAMPING)
+        moving = (np.abs(step) > TOLERANCE_MM).any(axis=1) & (damping < MAX_DAMPING)
         if bound is None:
             x[rows] += np.where(
                 moving[:, None], 0.0, step

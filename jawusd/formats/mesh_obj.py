@@ -14,7 +14,7 @@ import numpy as np
 
 from jawusd.base.arrays import Array
 from jawusd.base.errors import CaptureError
-from jawusd.formats.mesh_data import (
+from jawusd.formats.mesh import (
     COPY_AGAIN,
     Indices,
     MeshData,

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from jawusd.base.arrays import Array
 from jawusd.base.errors import CaptureError
-from jawusd.formats.mesh_data import (
+from jawusd.formats.mesh import (
     Indices,
     MeshData,
     byte_colors,

@@ -14,7 +14,7 @@ import numpy as np
 
 from jawusd.base.arrays import Array
 from jawusd.base.errors import CaptureError
-from jawusd.formats.mesh_data import COPY_AGAIN, MOST_TRIANGLES, MeshData, check_count, cut_off, read_mesh_bytes
+from jawusd.formats.mesh import COPY_AGAIN, MOST_TRIANGLES, MeshData, check_count, cut_off, read_mesh_bytes
 
 _HEADER = 84
 _TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])

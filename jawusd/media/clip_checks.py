@@ -13,7 +13,7 @@ from jawusd.base.errors import JawusdError
 from jawusd.formats.file_names import gaps
 from jawusd.formats.finding import Finding
 from jawusd.media.clip import INTERLACED, INTERLACED_HINT, Clip
-from jawusd.media.picture_sequence import PictureSequence
+from jawusd.media.footage import PictureSequence
 
 # Maximum drift between cameras over a take [frames]; larger drifts are reported.
 _DRIFT_FRAMES = 0.5

@@ -1,9 +1,13 @@
-"""Read live images of a camera from a device, a network stream, or a file played at its own frame rate."""
+"""Read live images of a camera from a device, a network stream, or a file played at its own frame rate.
+
+`now_s` and `wait_until` are the live clock, which tests replace.
+"""
 
 from __future__ import annotations
 
 import sys
 import threading
+import time
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -13,9 +17,19 @@ import av
 import numpy as np
 
 from jawusd.base.errors import CaptureError
-from jawusd.media import live_clock
 from jawusd.media.pixels import ColourPicture, DecodedPicture
 from jawusd.media.video import Video
+
+
+def now_s() -> float:
+    """Return the time [s] since an arbitrary origin."""
+    return time.monotonic()
+
+
+def wait_until(time_s: float, stopped: threading.Event) -> bool:
+    """Wait until a time [s]; return whether `stopped` was set before then."""
+    return stopped.wait(max(0.0, time_s - time.monotonic()))
+
 
 _WAIT_S = 0.1
 _KEPT = 8  # maximum number of images that wait for processing; older ones are discarded
@@ -52,7 +66,7 @@ class LiveSource:
 
     def open(self, from_s: float = 0.0) -> None:
         """Open the source in a thread; files start `from_s` [s] after the recordings begin; see `play`."""
-        self._heard_s = live_clock.now_s()
+        self._heard_s = now_s()
         threading.Thread(target=self._read, args=(from_s,), daemon=True).start()
 
     def wait_open(self, silence_s: float) -> None:
@@ -70,7 +84,7 @@ class LiveSource:
         Raises:
             CaptureError: it has not sent an image.
         """
-        if self._streams and not self.ended and live_clock.now_s() - self._heard_s > silence_s:
+        if self._streams and not self.ended and now_s() - self._heard_s > silence_s:
             raise CaptureError(
                 f"has sent no image for {silence_s:g} s.",
                 path=self.where,
@@ -78,7 +92,7 @@ class LiveSource:
             )
 
     def play(self, begin_s: float) -> None:
-        """Start delivering images; the recordings of files begin at `begin_s` on `live_clock`."""
+        """Start delivering images; the recordings of files begin at `begin_s` on the live clock."""
         self._begin_s = begin_s
         self._playing.set()
 
@@ -142,7 +156,7 @@ class LiveSource:
             self._open.set()
             self._playing.wait()
             due = self._begin_s - self._early_s + float(time_s)
-            if picture is None or live_clock.wait_until(due, self._stopped):
+            if picture is None or wait_until(due, self._stopped):
                 return
             yield LivePicture(due, picture)
 
@@ -154,7 +168,7 @@ class LiveSource:
             with av.open(address, format=name if device else None) as container:
                 for frame in container.decode(video=0):
                     self._open.set()
-                    self._heard_s = live_clock.now_s()
+                    self._heard_s = now_s()
                     yield LivePicture(self._heard_s, DecodedPicture(frame, 0))
         except (av.FFmpegError, OSError, IndexError) as error:
             raise CaptureError(

@@ -15,10 +15,10 @@ from jawusd.base.errors import CaptureError
 from jawusd.formats.capture import CameraSource
 from jawusd.formats.clips import ClipSource
 from jawusd.formats.file_names import is_pattern
+from jawusd.media.clip import Timeline
 from jawusd.media.footage import open_clip
 from jawusd.media.mask_files import LabelValues, PngMasks, VideoMasks
 from jawusd.media.mask_levels import MaskImage, MaskLevels
-from jawusd.media.timeline import Timeline
 from jawusd.media.video import Video
 
 _LOOKED_AT = 10  # number of label images that are sampled

@@ -1,9 +1,14 @@
-"""Draw tracked scans over the footage for visual checks (figs. 10 and 11 of the paper)."""
+"""Draw tracked scans over the footage for visual checks (figs. 10 and 11 of the paper), and scans with their labels.
+
+The background is the footage of a camera, or its masks if there is no footage. Labels of crown, gum and base are shown
+as colours, from the occlusal side, front, left and right.
+"""
 
 from __future__ import annotations
 
 import math
 import os
+import threading
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -13,12 +18,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jawusd.base.arrays import Array
+from jawusd.base.errors import CaptureError
 from jawusd.formats.atomic import write_bytes_atomic
-from jawusd.formats.mesh import Mesh, crown_face_mask
+from jawusd.formats.capture import CameraSource
+from jawusd.formats.mesh import BASE, GUM, TOOTH, Mesh, crown_face_mask
 from jawusd.formats.performance import STATE_COLOURS, SolveState
 from jawusd.formats.tracks import LOST, Tracks
 from jawusd.geometry import Camera, transform_points
-from jawusd.media.backdrop import Backdrop
+from jawusd.media.footage import FrameReader, open_clip
+from jawusd.media.masks import mask_size_px, open_masks
 from jawusd.meshes.raster import draw_depth_labels
 
 #: Colour: red, green and blue, 0 to 255.
@@ -195,3 +203,142 @@ def captioned(tile: NDArray[np.uint8], text: str) -> NDArray[np.uint8]:
     out = np.vstack([np.zeros((CAPTION_PX, tile.shape[1], 3), np.uint8), tile])
     cv2.putText(out, text, (6, CAPTION_PX - 7), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (255, 255, 255), 1, cv2.LINE_AA)
     return out
+
+
+#: Gray values of upper teeth, lower teeth and background in masks.
+_UPPER, _LOWER, _NEITHER = 150, 105, 25
+
+
+class Backdrop:
+    """Background images of one camera, by frame number of the reference camera; thread-safe.
+
+    Attributes:
+        size_px: (width, height) of the images.
+        count: one past the last frame number of the camera itself.
+        is_footage: whether the images are footage instead of masks.
+    """
+
+    def __init__(self, source: CameraSource, offset: int) -> None:
+        """Open the footage or masks; their frame k is simultaneous with frame k + offset of the reference camera.
+
+        Raises:
+            CaptureError: the camera has neither a video nor masks, or they cannot be decoded.
+        """
+        self._offset = offset
+        self._lock = threading.Lock()
+        self.is_footage = source.clip is not None
+        if source.clip is not None:
+            self._reader = FrameReader(open_clip(source.clip))
+            self.size_px, self.count = self._reader.video.size_px, self._reader.video.timeline.count
+        elif source.masks is not None:
+            self.size_px = mask_size_px(source.masks.upper)
+            self._masks = open_masks(source, self.size_px)
+            self.count = max(masks.count for masks in self._masks)
+        else:
+            raise CaptureError(
+                "has neither a video nor masks to draw over.",
+                camera=source.name,
+                hint="Add one of them in the capture file.",
+            )
+
+    def picture(self, frame: int) -> NDArray[np.uint8] | None:
+        """Return the image at a frame of the reference camera, (h, w, 3) RGB, read-only, or None.
+
+        Raises:
+            CaptureError: the image cannot be decoded.
+        """
+        own = frame - self._offset
+        if self.is_footage:
+            number = self._reader.video.timeline.picture(own)
+            return None if number is None else self._reader.picture(number)
+        with self._lock:
+            found = [masks.read(own) for masks in self._masks]
+        width, height = self.size_px
+        out = np.full((height, width), _NEITHER, np.uint8)
+        for mask, gray in zip(found, (_UPPER, _LOWER), strict=True):
+            if mask is not None:
+                out[mask > 127] = gray
+        return np.repeat(out[:, :, None], 3, axis=2)
+
+    def close(self) -> None:
+        """Stop decoding in the background."""
+        if not self.is_footage:
+            for masks in self._masks:
+                masks.close()
+
+
+#: RGB colours of the labels: gum, crown, crown at a border of interest, base.
+COLOURS = np.array([(214, 108, 112), (240, 234, 214), (150, 205, 130), (120, 135, 165)], np.uint8)
+_BACKGROUND = (40, 42, 46)
+_TILE_PX = (520, 400)
+_FILLED = 0.92  # fraction of the tile size that the scan fills
+_FAR_MM = 1000.0  # camera distance, large enough for nearly orthographic views
+_LEAST_LIGHT = 0.35
+# Camera axes of each view: matrices whose rows are right, up and towards the camera, in (left, up, front) axes of the
+# subject. The occlusal side of the upper arch is seen from below, that of the lower arch from above, with the front
+# teeth at the top.
+_SIDES = {
+    "front": ((1, 0, 0), (0, 1, 0), (0, 0, 1)),
+    "left": ((0, 0, -1), (0, 1, 0), (1, 0, 0)),
+    "right": ((0, 0, 1), (0, 1, 0), (-1, 0, 0)),
+}
+_BITING = {"upper": ((-1, 0, 0), (0, 0, 1), (0, -1, 0)), "lower": ((1, 0, 0), (0, 0, 1), (0, 1, 0))}
+
+
+def label_sheet(
+    scans: Sequence[tuple[str, Mesh, NDArray[np.uint8]]],
+    T_anatomical_scan: Array,
+    captions: Sequence[str],
+) -> NDArray[np.uint8]:
+    """Return one RGB image with a row of four views for each scan.
+
+    Args:
+        scans: for each scan: "upper" or "lower", the scan, and a label of `formats.mesh` for each vertex.
+        T_anatomical_scan: transform from the scan frame to (left, up, front) axes, shape (4, 4).
+        captions: one line per scan, written above its row of views.
+    """
+    tiles = []
+    for (arch, mesh, labels), caption in zip(scans, captions, strict=True):
+        points = mesh.vertices @ T_anatomical_scan[:3, :3].T
+        sides = {"biting side": _BITING[arch], **_SIDES}
+        for number, (name, axes) in enumerate(sides.items()):
+            tile = _view(points @ np.array(axes, np.float64).T, mesh.faces, labels)
+            tiles.append(captioned(tile, caption if number == 0 else f"{arch}: {name}"))
+    return contact_sheet(tiles, len(_SIDES) + 1)
+
+
+def _view(points: Array, faces: NDArray[np.int32], labels: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Draw a surface with points (V, 3) [mm] in view axes (right, up, towards the camera); return an RGB tile."""
+    width, height = _TILE_PX
+    low, high = points.min(axis=0), points.max(axis=0)
+    px_per_mm = _FILLED * min(width / max(high[0] - low[0], 1.0), height / max(high[1] - low[1], 1.0))
+    middle = (low + high) / 2
+    placed = np.column_stack(
+        [
+            width / 2 + px_per_mm * (points[:, 0] - middle[0]),
+            height / 2 - px_per_mm * (points[:, 1] - middle[1]),
+            _FAR_MM - (points[:, 2] - middle[2]),
+        ]
+    ).astype(np.float32)
+    inverse_depth, seen = np.zeros((height, width), np.float32), np.zeros((height, width), np.uint8)
+    of_face = face_labels(labels, faces)
+    for label in range(BASE + 1):
+        draw_depth_labels(placed, faces[of_face == label], 0, 0, False, inverse_depth, seen, label)
+    image = np.empty((height, width, 3), np.uint8)
+    image[:] = _BACKGROUND
+    drawn = inverse_depth > 0
+    depth = np.where(drawn, 1.0 / np.where(drawn, inverse_depth, 1.0), _FAR_MM) * px_per_mm
+    down, right = np.gradient(depth)
+    light = 1.0 / np.sqrt(1.0 + down**2 + right**2)  # light from the camera
+    light = _LEAST_LIGHT + (1 - _LEAST_LIGHT) * light
+    image[drawn] = (COLOURS[seen[drawn]] * light[drawn][:, None]).astype(np.uint8)
+    return image
+
+
+def face_labels(labels: NDArray[np.uint8], faces: NDArray[np.int32]) -> NDArray[np.uint8]:
+    """Return the label of each face, shape (F,): crown if at least two corners are crown, otherwise gum or base."""
+    corner = labels[faces]
+    tooth = (corner == TOOTH) | (corner > TOOTH) & (corner < BASE)
+    rest = np.where((corner == BASE).sum(axis=1) >= 2, BASE, GUM)
+    interest = np.where((corner > TOOTH).sum(axis=1) >= 2, TOOTH + 1, TOOTH)
+    return np.where(tooth.sum(axis=1) >= 2, interest, rest).astype(np.uint8)

@@ -20,8 +20,7 @@ from PIL import ExifTags, Image
 from jawusd.base.errors import CaptureError
 from jawusd.base.inputs import check_input
 from jawusd.media.containers import MOST_PX, PICTURES, open_container
-from jawusd.media.display import Stored
-from jawusd.media.pixels import TO_RGB
+from jawusd.media.pixels import TO_RGB, Stored
 
 RawPicture = NDArray[np.uint8] | NDArray[np.uint16]
 

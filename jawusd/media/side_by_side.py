@@ -17,12 +17,12 @@ from jawusd.formats.mesh import Mesh, crown_face_mask
 from jawusd.formats.performance import STATE_COLOURS, STATE_WORDS, SolveState
 from jawusd.formats.tracks import Tracks
 from jawusd.geometry import Camera, transform_points
-from jawusd.media.backdrop import Backdrop
 from jawusd.media.overlay import (
     CAPTION_PX,
     EMPTY_GRAY,
     LOWER_COLOUR,
     UPPER_COLOUR,
+    Backdrop,
     Colour,
     PlacedScan,
     captioned,

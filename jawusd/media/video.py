@@ -18,11 +18,19 @@ from numpy.typing import NDArray
 from jawusd.base.errors import CaptureError, naming_file
 from jawusd.base.inputs import check_input, why_unreadable
 from jawusd.formats.clips import timecode_rates
-from jawusd.media.clip import Clip, VideoFrame
+from jawusd.media.clip import Clip, Timeline, VideoFrame
 from jawusd.media.containers import MOST_PX, open_container, slices_are_whole
-from jawusd.media.display import to_display
-from jawusd.media.pixels import Colour, ColourPicture, DecodedPicture, Slices, coloured, converted, deep_rgb, turn_deg
-from jawusd.media.timeline import Timeline
+from jawusd.media.pixels import (
+    Colour,
+    ColourPicture,
+    DecodedPicture,
+    Slices,
+    coloured,
+    converted,
+    deep_rgb,
+    to_display,
+    turn_deg,
+)
 
 _REENCODE = "Re-encode the video, for example: ffmpeg -i IN -c:v libx264 -crf 12 OUT.mp4."
 _CUT_OFF = "Copy the file again from the camera; repair an interrupted recording first."
@@ -48,7 +56,7 @@ class Video(Clip):
 
         Args:
             path: the file.
-            colour_space, colour_config: colour space of the images if they are not display-referred; see `display`.
+            colour_space, colour_config: colour space of the images if they are not display-referred; see `pixels`.
 
         Raises:
             CaptureError: the file is missing, empty, truncated, not a video, or has no presentation times.

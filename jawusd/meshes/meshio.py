@@ -16,8 +16,7 @@ from jawusd.base.arrays import Array
 from jawusd.base.errors import CaptureError, explain_missing_packages
 from jawusd.base.inputs import check_input, why_unreadable
 from jawusd.formats.file_names import MESHES
-from jawusd.formats.mesh import Mesh, tooth_labels, without_loose
-from jawusd.formats.mesh_data import NO_COLOUR, MeshData
+from jawusd.formats.mesh import NO_COLOUR, Mesh, MeshData, tooth_labels, without_loose
 from jawusd.formats.mesh_obj import read_obj
 from jawusd.formats.mesh_ply import read_ply
 from jawusd.formats.mesh_stl import read_stl

@@ -14,9 +14,9 @@ from typing import NamedTuple
 import numba
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt
 
 from jawusd.base.arrays import Array, Mask
-from jawusd.meshes.spreading import spread
 
 _BUCKET_MM = 1.0  # cell size in the (x, z) plane of the triangle lookup
 # Width of the band around triangles in which the nearest triangle is found exactly and then propagated.
@@ -90,13 +90,26 @@ def distance_grid(corners: Array, outer: Mask, box: Array, step_mm: float, up: f
     """
     nx, ny, nz = (int(n) for n in np.ceil((box[1] - box[0]) / step_mm) + 1)
     kept = np.ascontiguousarray(corners[outer])
-    nearest = _nearest_faces(kept, box[0], step_mm, (nx, ny, nz), _BAND_CELLS)
-    away = spread(nearest)
+    nearest, away_cells = _spread(_nearest_faces(kept, box[0], step_mm, (nx, ny, nz), _BAND_CELLS))
     flipped = _upwards(corners, up)
     values = np.ones(nearest.shape, np.float32)
     _set_signs(values, flipped, box[0], step_mm, up, _columns_of(flipped))
-    _set_distances(values, kept, nearest, away, _walls(kept, box[0], step_mm, values.shape), box[0], step_mm, far_mm)
+    _set_distances(
+        values, kept, nearest, away_cells, _walls(kept, box[0], step_mm, values.shape), box[0], step_mm, far_mm
+    )
     return DistanceGrid(np.array(box[0]), step_mm, values)
+
+
+def _spread(numbers: NDArray[np.int32]) -> tuple[NDArray[np.int32], Array]:
+    """Return the numbers of the nearest cells whose number is not negative, and the distances to these cells [cells].
+
+    Without such cells, all numbers stay negative, and the distances are larger than any in the grid.
+    """
+    empty = numbers < 0
+    if empty.all():
+        return numbers, np.full(numbers.shape, float(sum(numbers.shape)))
+    away, place = distance_transform_edt(empty, return_indices=True)
+    return numbers[tuple(place)], away
 
 
 def _walls(corners: Array, origin: Array, step: float, shape: tuple[int, ...]) -> Array:
@@ -252,7 +265,7 @@ def _set_distances(
     values: NDArray[np.float32],
     corners: Array,
     nearest: NDArray[np.int32],
-    away: NDArray[np.int32],
+    away_cells: Array,
     walls: Array,
     origin: Array,
     step: float,
@@ -271,7 +284,7 @@ def _set_distances(
                 # Lower bound of the distance: distance to the nearest grid point of the band around the surface, plus
                 # the width `_BAND_CELLS` of the band, less a cell diagonal.
                 least = step * min(
-                    np.sqrt(away[i, j, k]) + _BAND_CELLS - _DIAGONAL_CELLS, to_wall, k - walls[0, 2], walls[1, 2] - k
+                    away_cells[i, j, k] + _BAND_CELLS - _DIAGONAL_CELLS, to_wall, k - walls[0, 2], walls[1, 2] - k
                 )
                 if own < 0 or (values[i, j, k] > 0 and least > far):
                     values[i, j, k] *= least

@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING
 from jawusd.base.errors import CalibrationError, CaptureError, FormatError, OutputError, explain_missing_packages
 from jawusd.cameras.calibration import save_calibration
 from jawusd.cameras.colmap import save_colmap
-from jawusd.cameras.files import lacks_sizes, load_cameras_file
-from jawusd.cameras.parts import plain_name
+from jawusd.cameras.files import lacks_sizes, load_cameras_file, plain_name
 from jawusd.formats.capture import CameraSource, Capture
 from jawusd.formats.mesh import Mesh
 from jawusd.formats.tracks import Tracks
@@ -19,8 +18,8 @@ from jawusd.geometry import Camera
 from jawusd.pipeline.subject import load_meshes, registered_meshes
 
 if TYPE_CHECKING:
-    from jawusd.media.backdrop import Backdrop
     from jawusd.media.clip import Clip
+    from jawusd.media.overlay import Backdrop
 
 
 Size = tuple[int, int]
@@ -233,7 +232,7 @@ def open_backdrops(capture: Capture, offsets: Mapping[str, int]) -> dict[str, Ba
     Raises:
         CaptureError: no camera has video or masks, or one cannot be decoded.
     """
-    from jawusd.media.backdrop import Backdrop
+    from jawusd.media.overlay import Backdrop
 
     sources = [source for source in capture.cameras if source.video or source.masks]
     if not sources:

@@ -16,7 +16,7 @@ from jawusd.base.arrays import Array, Mask
 from jawusd.base.errors import EvaluatorError, FormatError, OutputError, explain_missing_packages
 from jawusd.evaluator import JawRig, load
 from jawusd.evaluator.bounds import SMALLEST_REACH_MM
-from jawusd.evaluator.schema import HELD_OUT_ARRAYS
+from jawusd.evaluator.kinds import HELD_OUT_ARRAYS
 from jawusd.formats.atomic import refuse_existing
 from jawusd.formats.model import JawModel, load_model, save_model
 from jawusd.library.index import MODEL_FILE, Entry, Library, load_donors, scan_library

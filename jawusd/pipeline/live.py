@@ -17,7 +17,7 @@ from jawusd.base.errors import CaptureError, explain_missing_packages, naming_fi
 from jawusd.evaluator import JawRig
 from jawusd.formats.capture import Capture
 from jawusd.formats.performance import SolveState
-from jawusd.media import live_clock
+from jawusd.media import live_source
 from jawusd.pipeline.calibrate import sync_cameras
 from jawusd.pipeline.cameras import load_cameras
 from jawusd.pipeline.capture_inputs import open_capture
@@ -179,7 +179,7 @@ class _Follower:
             source.open(start * self._period_s)
         for source in self._sources.values():
             source.wait_open(silence_s)
-        begin = live_clock.now_s() - start * self._period_s
+        begin = live_source.now_s() - start * self._period_s
         for source in self._sources.values():
             source.play(begin)
         if self._skin is not None:
@@ -228,7 +228,7 @@ class _Follower:
             margin_mm=float(verdict.margin_mm[0]),
             verdict=verdict.words()[0],
             state=str(jaw.state),
-            latency_ms=1e3 * (live_clock.now_s() - at),
+            latency_ms=1e3 * (live_source.now_s() - at),
             dropped=dropped,
             familiar=jaw.familiar,
         )

@@ -18,7 +18,7 @@ from jawusd.evaluator import JawRig
 from jawusd.evaluator.skin import Skin, SkinJaw
 from jawusd.formats.face_table import FaceTable, read_face_row
 from jawusd.formats.performance import SolveState
-from jawusd.media import live_clock
+from jawusd.media import live_source
 from jawusd.pipeline.live_frame import LiveJaw
 from jawusd.pipeline.markers import LENGTH_UNITS_MM
 from jawusd.pipeline.skin import load_own_skin, own_columns, read_face
@@ -56,7 +56,7 @@ class LiveSkin:
         self._face: RecordedFace | FaceStream = (RecordedFace if whole else FaceStream)(self._skin, options)
 
     def play(self, begin_s: float, silence_s: float) -> None:
-        """Start the face: a recording at `begin_s` on `live_clock`; a stream when its first row has arrived.
+        """Start the face: a recording at `begin_s` on the live clock; a stream when its first row has arrived.
 
         Raises:
             FormatError: a stream has no row within `silence_s` [s], or an invalid one.
@@ -71,7 +71,7 @@ class LiveSkin:
         """Return the jaw of a frame corrected by the skin; the state is `SKIN` if an arch is hidden and skin was used.
 
         Args:
-            at_s: time of the images on `live_clock` [s].
+            at_s: time of the images on the live clock [s].
             jaw: the jaw without skin.
             seconds: time since the previous frame [s].
 
@@ -109,14 +109,14 @@ class RecordedFace:
         self._begin_s = 0.0
 
     def play(self, begin_s: float, silence_s: float) -> None:
-        """Start at a time on `live_clock` [s]."""
+        """Start at a time on the live clock [s]."""
         self._begin_s = begin_s
 
     def stop(self) -> None:
         """Do nothing: the file is closed."""
 
     def at(self, time_s: float) -> Array:
-        """Return the columns (K,) at a time on `live_clock` [s]; NaN where unknown."""
+        """Return the columns (K,) at a time on the live clock [s]; NaN where unknown."""
         return columns_between(self._times_s + self._begin_s, self._rows, time_s)
 
 
@@ -164,13 +164,13 @@ class FaceStream:
         self._stopped.set()
 
     def at(self, time_s: float) -> Array:
-        """Return the columns (K,) at a time on `live_clock` [s], after waiting for the row after it; NaN where unknown.
+        """Return the columns (K,) at a time of the live clock [s], waiting for the row after it; NaN where unknown.
 
         Raises:
             FormatError: a row is invalid, or has other columns than the map.
         """
         with self._changed:
-            left_s = max(0.0, time_s + _LATE_S - live_clock.now_s())
+            left_s = max(0.0, time_s + _LATE_S - live_source.now_s())
             self._changed.wait_for(lambda: self._error or self._rows[-1][0] + self._offset_s() > time_s, left_s)
             if self._error is not None:
                 raise self._error
@@ -180,7 +180,7 @@ class FaceStream:
         return columns_between(times_s[max(k - 1, 0) : k + 1], np.stack([row for _, row in near]), time_s)
 
     def _offset_s(self) -> float:
-        """Return the seconds from the clock of the table to `live_clock`, by the row that arrived with least delay."""
+        """Return the seconds from the table's clock to the live clock, by the row that arrived with least delay."""
         return min(self._ahead_s) + (self._options.offset_s or 0.0)
 
     def _read(self) -> None:
@@ -205,7 +205,7 @@ class FaceStream:
 
     def _take(self, face: FaceTable, number: int) -> None:
         """Keep a row."""
-        arrived_s, options = live_clock.now_s(), self._options
+        arrived_s, options = live_source.now_s(), self._options
         found = own_columns(self._skin, options.skin, face, options.face)
         fps = face.fps or options.fps
         if not fps:

@@ -28,7 +28,7 @@ from jawusd.pipeline.cameras import (
 from jawusd.pipeline.state import Progress, make_folder
 
 if TYPE_CHECKING:
-    from jawusd.media.backdrop import Backdrop
+    from jawusd.media.overlay import Backdrop
     from jawusd.media.side_by_side import CameraWall
 
 
@@ -115,7 +115,7 @@ def write_plates(
         CaptureError, CalibrationError: see `open_footage`.
         OutputError: the files cannot be written.
     """
-    from jawusd.media.picture_sequence import PictureSequence
+    from jawusd.media.footage import PictureSequence
     from jawusd.media.writers import PlateWriter
     from jawusd.rig.cameras import LIGHT_PLATE, PLATE
 

@@ -161,8 +161,7 @@ def _stored(scan: LabelledScan, folder: Path | None) -> ScanSummary:
 
 
 def _draw(scans: Sequence[LabelledScan], summaries: Sequence[ScanSummary], capture: Capture, picture: Path) -> None:
-    from jawusd.media.label_picture import label_sheet
-    from jawusd.media.overlay import save_png
+    from jawusd.media.overlay import label_sheet, save_png
 
     given = capture.anatomy.T_anatomical_skull
     crowns = [scan.mesh.vertices[tooth_labels(scan.mesh) > 0] for scan in scans]

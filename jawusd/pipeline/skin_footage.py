@@ -12,8 +12,8 @@ from jawusd.base.errors import FittingError
 from jawusd.capture.skin_points import SkinTracker
 from jawusd.evaluator import JawRig
 from jawusd.evaluator.skin import Skin, SkinJaw
+from jawusd.fitting.face import in_head
 from jawusd.fitting.skin import fit_skin
-from jawusd.fitting.skin_points import in_head
 from jawusd.formats.capture import Capture
 from jawusd.geometry import Camera, se3_inverse, transform_point
 from jawusd.media.pixels import ColourPicture

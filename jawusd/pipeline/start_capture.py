@@ -13,7 +13,7 @@ import numpy as np
 
 from jawusd.base.errors import CaptureError, JawusdError, explain_missing_packages
 from jawusd.formats.atomic import write_text_atomic
-from jawusd.formats.capture_template import BoardSketch, CameraSketch, CaptureSketch, capture_text
+from jawusd.formats.capture_writing import BoardSketch, CameraSketch, CaptureSketch, capture_text
 from jawusd.pipeline.cameras import SameSize, read_calibration
 from jawusd.pipeline.folder_files import FoundFiles, camera_names, find_files, pair, with_masks, words
 from jawusd.pipeline.state import Progress

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from jawusd.base.arrays import Array
 from jawusd.base.errors import explain_missing_packages, naming_file
 from jawusd.formats.capture import Bootstrap, Capture
-from jawusd.formats.capture_edit import write_bootstrap
+from jawusd.formats.capture_writing import write_bootstrap
 from jawusd.formats.mesh import Mesh, crown_face_mask, tooth_labels
 from jawusd.formats.tracks import Tracks, load_tracks
 from jawusd.geometry import Camera
@@ -28,8 +28,7 @@ from jawusd.pipeline.state import BuildState, Progress
 from jawusd.pipeline.subject import load_meshes, registered_meshes, subject_of_capture
 
 if TYPE_CHECKING:
-    from jawusd.media.backdrop import Backdrop
-    from jawusd.media.overlay import PlacedScan
+    from jawusd.media.overlay import Backdrop, PlacedScan
     from jawusd.media.side_by_side import CameraWall
     from jawusd.viewer.server import CaptureViewer
     from jawusd.viewer.viewed import Look, ViewedCapture

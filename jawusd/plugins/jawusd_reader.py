@@ -27,10 +27,9 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 from jawusd.evaluator.formula import ON_BOUND_MM, BoundFormula
-from jawusd.evaluator.kinds import GLIDE_ARRAYS, MODELS, arrays_of
+from jawusd.evaluator.kinds import D_RANGE_ATTRIBUTES, GLIDE_ARRAYS, MODELS, arrays_of
 from jawusd.evaluator.nearest import nearest_in_valley, pulled_in
 from jawusd.evaluator.operations import FloatOperations, Rows, rows
-from jawusd.evaluator.schema import D_RANGE_ATTRIBUTES
 from jawusd.geometry.rodrigues import Triple
 
 if TYPE_CHECKING:

@@ -20,7 +20,7 @@ from jawusd.base.errors import RigError
 from jawusd.evaluator import JawRig
 from jawusd.geometry.se3 import make_transform
 from jawusd.geometry.so3 import so3_exp, wxyz_from_matrix
-from jawusd.rig import _gf
+from jawusd.rig import layers
 from jawusd.rig.layers import new_layer, relative_path, rename_actor, stage_of, write_layer
 from jawusd.rig.layout import ACTOR, MANDIBLE, MODEL_HASH_KEY, PARAMETERS, rig_prims
 from jawusd.rig.read import load_rig, open_stage
@@ -99,7 +99,7 @@ def write_animation(
     layer.startTimeCode, layer.endTimeCode = float(frames[0]), float(frames[-1])
     note_unseen(layer, carried, by_skin)
     if not known.all():
-        lost = _gf.int_array(np.floor(frames[~known]))
+        lost = layers.int_array(np.floor(frames[~known]))
         layer.customLayerData = {**layer.customLayerData, LOST: lost}
     author_motion(layer, rig, frames[known], d[known], frames[[0, -1]])
     if paths := list(skinned):
@@ -111,7 +111,7 @@ def note_unseen(layer: Sdf.Layer, carried: ArrayLike, by_skin: ArrayLike) -> Non
     """Write the frames (F,) whose d was not measured to the layer's `customLayerData`; see `write_animation`."""
     for key, frames in ((CARRIED, carried), (SKIN, by_skin)):
         if len(np.atleast_1d(frames)):
-            layer.customLayerData = {**layer.customLayerData, key: _gf.int_array(np.floor(np.asarray(frames)))}
+            layer.customLayerData = {**layer.customLayerData, key: layers.int_array(np.floor(np.asarray(frames)))}
 
 
 def root_prim_of(actor: Path) -> str:
@@ -182,9 +182,9 @@ def author_motion(
     times, poses = bake_times(rig, frames, d, span)
     mandible = Sdf.CreatePrimInLayer(layer, paths[1])
     translate = Sdf.AttributeSpec(mandible, "xformOp:translate", Sdf.ValueTypeNames.Double3)
-    _set_samples(layer, translate, times, _gf.translations(poses))
+    _set_samples(layer, translate, times, layers.translations(poses))
     orient = Sdf.AttributeSpec(mandible, "xformOp:orient", Sdf.ValueTypeNames.Quatd)
-    _set_samples(layer, orient, times, _gf.rotations(poses))
+    _set_samples(layer, orient, times, layers.rotations(poses))
 
 
 def _set_samples(

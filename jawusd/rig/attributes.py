@@ -21,9 +21,8 @@ from pxr import Sdf, Usd
 from jawusd.base.arrays import Array, Mask
 from jawusd.base.errors import FormatError, VersionError
 from jawusd.evaluator import JawRig
-from jawusd.evaluator.kinds import arrays_of, optional_of
-from jawusd.evaluator.schema import D_RANGE_ATTRIBUTES, ArraySpec
-from jawusd.rig import _gf
+from jawusd.evaluator.kinds import D_RANGE_ATTRIBUTES, ArraySpec, arrays_of, optional_of
+from jawusd.rig import layers
 from jawusd.rig.layers import set_attribute
 from jawusd.rig.layout import FORMAT_VERSION
 
@@ -47,9 +46,9 @@ def write_arrays(prim: Sdf.PrimSpec, rig: JawRig, prefixes: tuple[str, ...]) -> 
             continue
         value = rig.arrays[name]
         if spec.integer:
-            set_attribute(prim, spec.attribute, _TYPES.IntArray, _gf.int_array(value))
+            set_attribute(prim, spec.attribute, _TYPES.IntArray, layers.int_array(value))
         elif spec.shape:
-            set_attribute(prim, spec.attribute, _TYPES.DoubleArray, _gf.double_array(value))
+            set_attribute(prim, spec.attribute, _TYPES.DoubleArray, layers.double_array(value))
         else:
             set_attribute(prim, spec.attribute, _TYPES.Double, float(value))
 

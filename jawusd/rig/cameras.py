@@ -15,10 +15,10 @@ from pxr import Gf, Kind, Sdf, Usd, UsdGeom
 
 from jawusd.base.arrays import Array
 from jawusd.base.errors import CalibrationError, RigError
-from jawusd.cameras.parts import names_of_labels
+from jawusd.cameras.files import names_of_labels
 from jawusd.geometry.camera import Camera
 from jawusd.geometry.se3 import make_transform, se3_inverse
-from jawusd.rig import _gf
+from jawusd.rig import layers
 from jawusd.rig.animation import root_prim_of
 from jawusd.rig.layers import add_pose, define_prim, new_layer, relative_path, set_attribute, stage_of, write_layer
 from jawusd.rig.read import open_stage
@@ -115,7 +115,7 @@ def _motion_layer(actor_path: str, frames: Array, T_world_skull: Array, fps: flo
     stage = stage_of(layer)
     add_pose(stage.GetPrimAtPath(actor_path), T_world_skull[0])
     translate, orient = UsdGeom.Xformable(stage.GetPrimAtPath(actor_path)).GetOrderedXformOps()
-    samples = zip(frames.tolist(), _gf.translations(T_world_skull), _gf.rotations(T_world_skull), strict=True)
+    samples = zip(frames.tolist(), layers.translations(T_world_skull), layers.rotations(T_world_skull), strict=True)
     for frame, translation, rotation in samples:
         translate.Set(translation, frame)
         orient.Set(rotation, frame)
@@ -240,6 +240,6 @@ def _define_camera(stage: Usd.Stage, path: Sdf.Path, camera: Camera, plate: str)
     prim.CreateClippingRangeAttr(Gf.Vec2f(*_CLIPPING_MM))
     add_pose(prim.GetPrim(), se3_inverse(camera.T_cam_world) @ _FLIP)
     spec = stage.GetRootLayer().GetPrimAtPath(path)
-    set_attribute(spec, "jaw:distortion", Sdf.ValueTypeNames.DoubleArray, _gf.double_array(camera.distortion))
+    set_attribute(spec, "jaw:distortion", Sdf.ValueTypeNames.DoubleArray, layers.double_array(camera.distortion))
     set_attribute(spec, "jaw:imageSize", Sdf.ValueTypeNames.Int2, Gf.Vec2i(width, height))
     set_attribute(spec, "jaw:plate", Sdf.ValueTypeNames.String, "./" + plate)

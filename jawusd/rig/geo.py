@@ -14,7 +14,7 @@ from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdShade
 from jawusd.base.arrays import Array, Mask
 from jawusd.base.errors import RigError
 from jawusd.formats.mesh import Mesh, crown_face_mask, natural_colors, without_loose
-from jawusd.rig import _gf
+from jawusd.rig import layers
 from jawusd.rig.attributes import value_of
 from jawusd.rig.layers import add_pose, define_prim, new_layer, set_attribute, stage_of
 from jawusd.rig.layout import ACTOR, GEO, MANDIBLE, MATERIALS, SKULL, rig_prims
@@ -52,11 +52,11 @@ def write_look(prim: UsdGeom.Mesh, mesh: Mesh, plain: tuple[float, float, float]
         prim.CreateDisplayColorAttr([plain])
     else:
         shown = prim.CreateDisplayColorPrimvar(UsdGeom.Tokens.vertex)
-        shown.Set(_gf.vec3f_array(linear_from_srgb(colors)))
+        shown.Set(layers.vec3f_array(linear_from_srgb(colors)))
     if mesh.uv is not None:
         kind = Sdf.ValueTypeNames.TexCoord2fArray
         places = UsdGeom.PrimvarsAPI(prim).CreatePrimvar(_UV, kind, UsdGeom.Tokens.faceVarying)
-        places.Set(_gf.vec2f_array(mesh.uv.reshape(-1, 2)))
+        places.Set(layers.vec2f_array(mesh.uv.reshape(-1, 2)))
 
 
 def hide_look(prim: UsdGeom.Mesh, mesh: Mesh, below: Mesh) -> None:
@@ -182,13 +182,13 @@ def _define_mesh(
     stage: Usd.Stage, path: str, mesh: Mesh, materials: Mapping[str, UsdShade.Material], base: str
 ) -> None:
     prim = UsdGeom.Mesh.Define(stage, path)
-    prim.CreatePointsAttr(_gf.vec3f_array(mesh.vertices))
-    prim.CreateFaceVertexIndicesAttr(_gf.int_array(mesh.faces))
-    prim.CreateFaceVertexCountsAttr(_gf.int_array(np.full(len(mesh.faces), 3)))
-    prim.CreateExtentAttr(_gf.vec3f_array(extent(mesh.vertices)))
+    prim.CreatePointsAttr(layers.vec3f_array(mesh.vertices))
+    prim.CreateFaceVertexIndicesAttr(layers.int_array(mesh.faces))
+    prim.CreateFaceVertexCountsAttr(layers.int_array(np.full(len(mesh.faces), 3)))
+    prim.CreateExtentAttr(layers.vec3f_array(extent(mesh.vertices)))
     prim.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
     prim.CreateDoubleSidedAttr(True)  # meshes are double-sided, because scans are open surfaces
-    prim.CreateNormalsAttr(_gf.vec3f_array(corner_normals(mesh)))
+    prim.CreateNormalsAttr(layers.vec3f_array(corner_normals(mesh)))
     prim.SetNormalsInterpolation(UsdGeom.Tokens.faceVarying)
     gum = ~crown_face_mask(mesh) if base == "Enamel" else np.zeros(len(mesh.faces), dtype=bool)
     write_look(prim, mesh, MATERIAL_LOOKS[base][0])
@@ -197,7 +197,7 @@ def _define_mesh(
     if gum.any():
         for name, faces in (("Gum", gum), ("Enamel", ~gum)):
             subset = binding.CreateMaterialBindSubset(
-                f"{prim.GetPrim().GetName()}{name}", _gf.int_array(np.flatnonzero(faces))
+                f"{prim.GetPrim().GetName()}{name}", layers.int_array(np.flatnonzero(faces))
             )
             UsdShade.MaterialBindingAPI.Apply(subset.GetPrim()).Bind(materials[name])
         binding.SetMaterialBindSubsetsFamilyType(UsdGeom.Tokens.partition)

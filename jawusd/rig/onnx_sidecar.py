@@ -31,9 +31,8 @@ from jawusd.base.version import __version__
 from jawusd.evaluator import JawRig
 from jawusd.evaluator.kinds import every_array
 from jawusd.formats.atomic import write_bytes_atomic
-from jawusd.rig.onnx_encoder import add_encoder
+from jawusd.rig.onnx_encoder import add_encoder, add_margin, add_twist, decode_motion, images
 from jawusd.rig.onnx_graph import FloatType, Graph, Value, float_type
-from jawusd.rig.onnx_model import add_margin, add_twist, decode_motion, images
 from jawusd.rig.table import landmark_distance, sample_valid
 
 FORMAT = "jawusd-onnx/1"

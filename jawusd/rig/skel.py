@@ -18,7 +18,7 @@ from jawusd.base.errors import FormatError
 from jawusd.evaluator import JawRig
 from jawusd.geometry.anatomy import LANDMARKS
 from jawusd.geometry.se3 import make_transform, se3_inverse, transform_points
-from jawusd.rig import _gf
+from jawusd.rig import layers
 from jawusd.rig.geo import MESH_PATHS
 from jawusd.rig.layers import define_prim, new_layer, rename_actor, stage_of, write_layer
 from jawusd.rig.layout import (
@@ -129,7 +129,7 @@ def _hinge(rig: JawRig) -> Array:
 
 def _define_skeleton(stage: Usd.Stage, hinge: Array) -> None:
     skeleton = UsdSkel.Skeleton.Define(stage, SKEL)
-    rest = Vt.Matrix4dArray([_gf.row_matrix(np.eye(4)), _gf.row_matrix(hinge)])
+    rest = Vt.Matrix4dArray([layers.row_matrix(np.eye(4)), layers.row_matrix(hinge)])
     skeleton.CreateJointsAttr(Vt.TokenArray(JOINTS))
     skeleton.CreateBindTransformsAttr(rest)
     skeleton.CreateRestTransformsAttr(rest)
@@ -143,15 +143,15 @@ def _define_motion(stage: Usd.Stage, rig: JawRig, frames: ArrayLike | None, d: A
     motion.CreateJointsAttr(Vt.TokenArray([JOINTS[1]]))
     motion.CreateScalesAttr(Vt.Vec3hArray([(1, 1, 1)]))
     translations, rotations = motion.CreateTranslationsAttr(), motion.CreateRotationsAttr()
-    translations.Set(_gf.vec3f_array(_hinge(rig)[None, :3, 3]))
-    rotations.Set(_gf.quatf_arrays(np.eye(4)[None])[0])
+    translations.Set(layers.vec3f_array(_hinge(rig)[None, :3, 3]))
+    rotations.Set(layers.quatf_arrays(np.eye(4)[None])[0])
     if frames is None or d is None:
         return None
     frames, d = np.asarray(frames, dtype=np.float64), np.asarray(d, dtype=np.float64)
     known = np.isfinite(d).all(axis=1)
     joint = joint_poses(rig, d[known])
-    for frame, T, rotation in zip(frames[known].tolist(), joint, _gf.quatf_arrays(joint), strict=True):
-        translations.Set(_gf.vec3f_array(T[None, :3, 3]), frame)
+    for frame, T, rotation in zip(frames[known].tolist(), joint, layers.quatf_arrays(joint), strict=True):
+        translations.Set(layers.vec3f_array(T[None, :3, 3]), frame)
         rotations.Set(rotation, frame)
     return frames[known] if known.any() else None
 
@@ -176,7 +176,7 @@ def _bind_mesh(mesh: Sdf.PrimSpec, skeleton: Sdf.Path, bind: Array, joint: int) 
     relationship = Sdf.RelationshipSpec(mesh, "skel:skeleton", custom=False)
     relationship.targetPathList.explicitItems = [skeleton]
     matrix = Sdf.AttributeSpec(mesh, "primvars:skel:geomBindTransform", _TYPES.Matrix4d)
-    matrix.default = _gf.row_matrix(bind)
+    matrix.default = layers.row_matrix(bind)
     values = (("jointIndices", _TYPES.IntArray, Vt.IntArray([joint])), ("jointWeights", _TYPES.FloatArray, [1.0]))
     for name, type_name, value in values:
         primvar = Sdf.AttributeSpec(mesh, f"primvars:skel:{name}", type_name)

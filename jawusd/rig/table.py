@@ -16,8 +16,8 @@ from numpy.typing import ArrayLike, NDArray
 from jawusd.base.arrays import Array
 from jawusd.base.errors import RigError
 from jawusd.evaluator import JawRig
+from jawusd.evaluator.batching import usable_rows
 from jawusd.evaluator.kinds import ADDITIVE
-from jawusd.evaluator.table import SampledTable
 from jawusd.geometry.se3 import se3_exp, transform_points
 
 DEFAULT_SIZE = 33  # default number of knots per axis
@@ -129,6 +129,9 @@ class DecoderTable:
         twists: Twists (omega [rad], v [mm]) in the skull frame, float32: (n1, n2, n3, 6), or (n1 + n2 + n3, 6).
         max_error_mm: Largest distance to the exact model found at any vertex.
         error_samples: Number of valid d at which `max_error_mm` was measured.
+
+    Raises:
+        ValueError: Shapes that do not match, or values that do not increase.
     """
 
     format: str
@@ -142,6 +145,8 @@ class DecoderTable:
         wanted = (*counts, 6) if self.format == "grid" else (sum(counts), 6)
         if self.twists.shape != wanted:
             raise ValueError(f"twists of a {self.format} {counts} must have shape {wanted}, got {self.twists.shape}")
+        if any(len(axis) < 2 or (np.diff(axis) <= 0).any() for axis in self.axes):
+            raise ValueError("the axes must be three increasing arrays of at least two values")
 
     def twist(self, d: ArrayLike) -> Array:
         """Return interpolated twists, shape (n, 6), at d (n, 3) [mm] clamped to the range of the knots."""
@@ -151,11 +156,26 @@ class DecoderTable:
             curves = zip(parts, self.axes, d.T, strict=True)
             columns = [[np.interp(x, axis, column) for column in part.T] for part, axis, x in curves]
             return np.sum(columns, axis=0).T
-        return SampledTable(self.axes, self.twists, np.eye(4)).twist(d)
+        d = usable_rows(d)
+        (i, a), (j, b), (k, c) = (_located(axis, column) for axis, column in zip(self.axes, d.T, strict=True))
+        near, far = (
+            (1 - a) * (1 - b) * self.twists[i, j, last]
+            + (1 - a) * b * self.twists[i, j + 1, last]
+            + a * (1 - b) * self.twists[i + 1, j, last]
+            + a * b * self.twists[i + 1, j + 1, last]
+            for last in (k, k + 1)
+        )
+        return np.asarray(near + c * (far - near))
 
     def pose(self, d: ArrayLike, T_rest: Array) -> Array:
         """Return poses T_skull_mandible, shape (n, 4, 4), at d (n, 3) [mm]: exp(twist) times the rest pose."""
         return se3_exp(self.twist(d)) @ T_rest
+
+
+def _located(axis: Array, x: Array) -> tuple[NDArray[np.intp], Array]:
+    """Return the cell (n,) of each x (n,) clamped to an axis, and the fraction of the way through it (n, 1)."""
+    cell = np.clip(axis.searchsorted(x, side="right") - 1, 0, len(axis) - 2)
+    return cell, np.clip((x - axis[cell]) / (axis[cell + 1] - axis[cell]), 0.0, 1.0)[:, None]
 
 
 def build_table(rig: JawRig, vertices: Array, size: int = DEFAULT_SIZE) -> DecoderTable:

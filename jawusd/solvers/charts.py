@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from jawusd.base.arrays import Array
+from jawusd.evaluator.curve_formula import spline
 from jawusd.evaluator.gauge import (
     INVERSE_ITERATIONS,
     INVERSE_STEP_MM,
@@ -28,7 +29,6 @@ from jawusd.evaluator.gauge import (
 from jawusd.evaluator.kinds import ADDITIVE, ANCHORED, AnchoredNumbers
 from jawusd.evaluator.models import FORMS
 from jawusd.evaluator.operations import triple
-from jawusd.evaluator.spline_formula import spline
 from jawusd.solvers.motion import OPERATIONS, MotionModule
 from jawusd.solvers.solution import applied, attached, capturing, finished, inverse
 

@@ -42,7 +42,7 @@ from jawusd.geometry import se3_exp, se3_inverse, transform_points
 from jawusd.pipeline.contact import condyle_solids, tooth_solids, with_condyle_contact, with_tooth_contact
 from jawusd.pipeline.fit import fit_subject
 from jawusd.pipeline.subject import Subject, _measured, load_meshes, subject_of_capture
-from jawusd.rig.author import decoder_layer
+from jawusd.rig.bake import decoder_layer
 from jawusd.rig.table import DecoderTable, sample_valid
 from jawusd.synthetic.anatomy import build_anatomy, opened_bite
 from jawusd.synthetic.exercises import record

@@ -35,7 +35,6 @@ from brute_force_ik import brute_force_ik  # noqa: E402
 from example_model import example_arrays, example_meta, touching_arrays  # noqa: E402
 
 from jawusd import evaluator  # noqa: E402
-from jawusd.evaluator.table import SampledTable  # noqa: E402
 from jawusd.fast import accelerate  # noqa: E402
 from jawusd.geometry.se3 import se3_exp, transform_points  # noqa: E402
 from jawusd.geometry.so3 import so3_exp  # noqa: E402
@@ -100,16 +99,16 @@ def axis_angle_joint(rotation: np.ndarray, translation: np.ndarray) -> np.ndarra
     return T
 
 
-def sampled(rig: evaluator.JawRig) -> tuple[tuple[np.ndarray, ...], np.ndarray, np.ndarray]:
-    """Return the arguments of the rig's table: 33 knots [mm] each way, twists, T_rest."""
+def sampled(rig: evaluator.JawRig) -> tuple[tuple[np.ndarray, ...], np.ndarray]:
+    """Return the arguments of the rig's table: 33 knots [mm] each way, twists."""
     knots = tuple(np.linspace(low, high, 33) for low, high in rig.d_range)
-    return knots, rig.twist(np.stack(np.meshgrid(*knots, indexing="ij"), axis=-1)), rig.T_rest
+    return knots, rig.twist(np.stack(np.meshgrid(*knots, indexing="ij"), axis=-1))
 
 
 def peers(rig: evaluator.JawRig, d: np.ndarray) -> dict[str, Callable[[], object]]:
     """Return one call of each peer."""
     session, sidecar, d32 = network(), one_thread(decode_model(rig)), d.astype(np.float32)
-    knots, twists, _ = sampled(rig)
+    knots, twists = sampled(rig)
     grid = RegularGridInterpolator(knots, twists)
     return {
         REFERENCE: lambda: session.run(None, {"d": d32}),
@@ -119,7 +118,7 @@ def peers(rig: evaluator.JawRig, d: np.ndarray) -> dict[str, Callable[[], object
     }
 
 
-def callers(rig: evaluator.JawRig, table: SampledTable | None, d: np.ndarray) -> dict[str, Callable[[], object]]:
+def callers(rig: evaluator.JawRig, d: np.ndarray) -> dict[str, Callable[[], object]]:
     """Return one call per function for these parameters; a single one is passed as shape (3,)."""
     single = len(d) == 1
     T = rig.pose(d)
@@ -139,8 +138,6 @@ def callers(rig: evaluator.JawRig, table: SampledTable | None, d: np.ndarray) ->
         "project": lambda: rig.project(x * 1.4),
         "ik, three handles": lambda: rig.ik(handles, goal, start=start),
     }
-    if table is not None:
-        rows["pose, table"] = lambda: table.pose(x)
     if len(d) > 1000:
         del rows["project"], rows["ik, three handles"]
     return rows
@@ -149,7 +146,6 @@ def callers(rig: evaluator.JawRig, table: SampledTable | None, d: np.ndarray) ->
 def timings(rigs: dict[str, evaluator.JawRig]) -> dict[str, dict[int, float]]:
     """Return seconds per call by row and batch size; rows of a rig carry its name."""
     plain = rigs["numpy"]
-    table = SampledTable(*sampled(plain))
     rng = np.random.default_rng(1)
     inside = plain.project(rng.uniform(*plain.d_range.T, (2000, 3)))
     found: dict[str, dict[int, float]] = {}
@@ -157,9 +153,7 @@ def timings(rigs: dict[str, evaluator.JawRig]) -> dict[str, dict[int, float]]:
         d = np.resize(inside, (size, 3))
         calls = peers(plain, d)
         for kind, rig in rigs.items():
-            calls |= {
-                f"{name} [{kind}]": call for name, call in callers(rig, table if kind == "numpy" else None, d).items()
-            }
+            calls |= {f"{name} [{kind}]": call for name, call in callers(rig, d).items()}
         for name, call in calls.items():
             if size == 1:
                 found.setdefault(f"{REFERENCE} beside {name}", {})[1] = seconds(calls[REFERENCE])
@@ -225,7 +219,7 @@ def stream_verdict_ms(rig: evaluator.JawRig) -> float:
 def checks(rigs: dict[str, evaluator.JawRig], table: dict[str, dict[int, float]]) -> None:
     """Print what the bars are about."""
     bars = {
-        "numpy": {"exact": 8, "table": 3, "exact rate": 0.4, "table rate": 1.5, "encode rate": 0.03, "stream": 0.5},
+        "numpy": {"exact": 8, "exact rate": 0.4, "encode rate": 0.03, "stream": 0.5},
         "fast": {"exact": 0.4, "exact rate": 1.5, "encode rate": 0.1, "stream": 0.1},
     }
     dragged = drags(rigs)
@@ -251,10 +245,7 @@ def checks(rigs: dict[str, evaluator.JawRig], table: dict[str, dict[int, float]]
             ("IK of three handles, one drag [ms]", drag_ms, "<= 1"),
             ("IK, worst of 1,000 drags over brute force [mm]", excess_mm, "<= 0"),
         ]
-        if kind == "numpy":
-            rows.append(("one pose, table / onnxruntime call", ratio("pose, table"), f"<= {bar['table']}"))
-            rows.append(("100,000 poses, table [M/s]", rate("pose, table"), f">= {bar['table rate']}"))
-        else:
+        if kind != "numpy":
             rows.append(("encoding of one pose / onnxruntime call", ratio("encode"), "<= 1.5"))
             rows.append(("verdict on one pose / onnxruntime call", ratio("validate poses"), "<= 1.8"))
             rows.append(("the same of a rig with teeth", verdict_with_teeth(rigs[kind]), "<= 1.8"))

@@ -23,7 +23,7 @@ from skin_dots import DottedFace
 from skin_shot import write_skin_shot
 
 from jawusd.fitting import skin as fitting
-from jawusd.fitting.skin_points import in_head
+from jawusd.fitting.face import in_head
 from jawusd.formats.capture import load_capture
 from jawusd.geometry import transform_points
 from jawusd.pipeline.cameras import load_cameras, open_videos

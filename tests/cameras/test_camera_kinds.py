@@ -13,8 +13,7 @@ from camera_writers import CAMERAS, NAMES, SIZE, colmap, metashape, nerfstudio, 
 from jawusd.base.errors import CalibrationError, JawusdError
 from jawusd.cameras import files as camera_files
 from jawusd.cameras.calibration import load_calibration, save_calibration
-from jawusd.cameras.files import calibration_files, lacks_sizes, load_cameras_file
-from jawusd.cameras.parts import CameraFormat, names_of_labels
+from jawusd.cameras.files import CameraFormat, calibration_files, lacks_sizes, load_cameras_file, names_of_labels
 from jawusd.pipeline import cameras as capture_cameras
 from jawusd.rig.cameras import read_cameras
 

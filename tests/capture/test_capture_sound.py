@@ -11,8 +11,8 @@ from scipy.signal import fftconvolve, resample_poly
 from jawusd.base.errors import CaptureError, SyncError
 from jawusd.capture.signals import RATE_HZ, Step, match_sounds, match_steps, to_frames
 from jawusd.capture.sync import align_videos, light_curve
+from jawusd.media.clip import Timeline
 from jawusd.media.containers import Sound, read_sound
-from jawusd.media.timeline import Timeline
 from jawusd.media.video import Video
 
 FPS = 24

@@ -15,7 +15,7 @@ from jawusd.cli.main import app
 from jawusd.formats.model import load_model
 from jawusd.formats.poses import write_poses
 from jawusd.geometry import LANDMARKS, make_transform
-from jawusd.paper import nlpca, synthesis
+from jawusd.paper import experiments, nlpca
 from jawusd.pipeline.report import TABLE_FILE
 from jawusd.synthetic.exercises import record
 from jawusd.synthetic.person import Person
@@ -142,8 +142,8 @@ def test_report_draws_and_prints_the_experiments(given, tmp_path, monkeypatch):
     """Run in this process, so that the networks' training can be cut to a tenth."""
     train = nlpca.train_nlpca
     monkeypatch.setattr(nlpca, "train_nlpca", lambda *a, **k: train(*a, **(k | {"stages": 2})))
-    monkeypatch.setattr(synthesis, "POSES", 200)
-    monkeypatch.setattr(synthesis, "_BATCH", 800)
+    monkeypatch.setattr(experiments, "POSES", 200)
+    monkeypatch.setattr(experiments, "_BATCH", 800)
     out = tmp_path / "figures"
     command = ["report", given / "poses.csv", "--experiments", "--landmarks", given / "landmarks.json", "-o", out]
     result = CliRunner().invoke(app, [*map(str, command), "--starts", "1", "--json"])

@@ -7,7 +7,7 @@ import pytest
 
 from jawusd.base.errors import FormatError, OutputError
 from jawusd.formats.capture import Bootstrap, Pick, PickView
-from jawusd.formats.capture_edit import with_bootstrap, write_bootstrap
+from jawusd.formats.capture_writing import with_bootstrap, write_bootstrap
 
 
 def picks(frame=20, count=3, shift=0.0):

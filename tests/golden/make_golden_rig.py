@@ -15,7 +15,7 @@ sys.path.insert(0, str(HERE.parent / "support"))
 
 from example_rig import example_meshes, touching_rig  # noqa: E402
 
-from jawusd.rig.author import decoder_layer, interface_layer  # noqa: E402
+from jawusd.rig.bake import decoder_layer, interface_layer  # noqa: E402
 from jawusd.rig.geo import build_geometry  # noqa: E402
 from jawusd.rig.layers import write_layer  # noqa: E402
 from jawusd.rig.layout import ACTOR_FILE, FORMAT_VERSION, GEO_FILE, ONNX_FILE, RIG_FILE  # noqa: E402

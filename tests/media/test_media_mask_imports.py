@@ -10,8 +10,8 @@ import pytest
 
 from jawusd.base.errors import CaptureError, FormatError
 from jawusd.formats.capture import CameraSource, load_capture
+from jawusd.media.clip import Timeline
 from jawusd.media.masks import MaskReader, open_masks
-from jawusd.media.timeline import Timeline
 from jawusd.media.writers import VideoWriter
 
 SIZE = (64, 48)

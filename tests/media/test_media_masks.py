@@ -14,9 +14,9 @@ from subjects.annotator import write_mask
 
 import jawusd
 from jawusd.base.errors import CaptureError
+from jawusd.media.clip import Timeline
 from jawusd.media.masks import MaskReader, mask_size_px
 from jawusd.media.pictures import read_gray
-from jawusd.media.timeline import Timeline
 from jawusd.media.writers import VideoWriter
 
 SIZE = (64, 40)

@@ -11,7 +11,7 @@ from jawusd.formats.mesh import Mesh
 from jawusd.formats.tracks import Tracks
 from jawusd.geometry import Camera, make_transform
 from jawusd.media import overlay
-from jawusd.media.backdrop import Backdrop
+from jawusd.media.overlay import Backdrop
 from jawusd.media.writers import VideoWriter
 
 SIZE = (160, 120)

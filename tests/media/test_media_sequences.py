@@ -13,9 +13,9 @@ from jawusd.base.errors import CaptureError
 from jawusd.formats.clips import ClipSource
 from jawusd.formats.file_names import gaps, groups, numbered_files
 from jawusd.media.clip_checks import rate_findings
-from jawusd.media.display import to_display
 from jawusd.media.footage import open_clip
 from jawusd.media.pictures import read_header, read_stored
+from jawusd.media.pixels import to_display
 from jawusd.media.writers import VideoWriter
 
 SIZE = (48, 64)

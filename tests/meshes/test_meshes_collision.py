@@ -135,3 +135,10 @@ def test_depth_grows_with_height_on_either_side(up):
     heights = np.linspace(10.0, 13.0, 7)
     depth = pair.depth(np.array([shifted([0.0, -up * h, 0.0]) for h in heights]))
     np.testing.assert_allclose(depth, 12.0 - heights, atol=0.05)
+
+
+def test_a_grid_far_from_every_triangle_has_finite_distances():
+    corners = ball()
+    far = np.array([[40.0, 40.0, 40.0], [42.0, 43.0, 44.0]])
+    grid = distance_grid(corners, np.ones(len(corners), bool), far, STEP_MM, 1.0, 1.0)
+    assert np.isfinite(grid.values).all() and grid.values.min() >= 0.0 and grid.values.max() >= 1.0

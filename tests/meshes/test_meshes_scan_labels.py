@@ -7,7 +7,7 @@ from scipy.spatial import cKDTree
 
 from jawusd.formats.mesh import Mesh, tooth_labels
 from jawusd.geometry import so3_exp
-from jawusd.media.label_picture import COLOURS, label_sheet
+from jawusd.media.overlay import COLOURS, label_sheet
 from jawusd.meshes.scan_labels import label_scan
 from jawusd.meshes.scan_surface import ScanSurface
 from jawusd.synthetic.dental_arch import ArchShape, build_arch

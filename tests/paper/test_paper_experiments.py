@@ -13,11 +13,19 @@ from jawusd.formats.experiments import TABLE_COLUMNS, CondylePath, save_table
 from jawusd.formats.mesh import Mesh
 from jawusd.formats.tracks import TRACKED, Tracks
 from jawusd.geometry import make_transform, se3_exp, transform_point, transform_points
-from jawusd.paper import nlpca, synthesis
+from jawusd.paper import experiments, nlpca
 from jawusd.paper.condyle_paths import condyle_paths, path_distances, principal_opening, sagittal_section
-from jawusd.paper.experiments import MODELS, run_experiments
+from jawusd.paper.experiments import (
+    BOX,
+    MODELS,
+    POLYGONS,
+    SLICES,
+    Bounds,
+    captured_reference,
+    distance_to_nearest,
+    run_experiments,
+)
 from jawusd.paper.nlpca import train_nlpca
-from jawusd.paper.synthesis import BOX, POLYGONS, SLICES, Bounds, captured_reference, distance_to_nearest
 from jawusd.synthetic.exercises import record
 from jawusd.synthetic.person import Person
 
@@ -49,8 +57,8 @@ def data(poses, anatomy):
 def quick():
     """Train the networks for a tenth of the usual time, and draw a fifth of the random poses."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(synthesis, "POSES", 200)
-        patch.setattr(synthesis, "_BATCH", 800)
+        patch.setattr(experiments, "POSES", 200)
+        patch.setattr(experiments, "_BATCH", 800)
         patch.setattr(nlpca, "train_nlpca", lambda *a, **k: train_nlpca(*a, **(k | {"stages": 2})))
         yield
 
@@ -86,7 +94,7 @@ def test_random_parameters_fill_each_bound_and_nothing_else():
     bounds = Bounds.of(d, 0.23)
     drawn = bounds.draw(np.random.default_rng(1))
     assert tuple(drawn) == (BOX, POLYGONS, SLICES)
-    assert {len(values) for values in drawn.values()} == {synthesis.POSES}
+    assert {len(values) for values in drawn.values()} == {experiments.POSES}
     assert (drawn[BOX] >= d.min(0)).all() and (drawn[BOX] <= d.max(0)).all()
     for axis, rings in zip((1, 2), bounds.rings, strict=True):
         shape = shapely.union_all([shapely.Polygon(ring) for ring in rings]).buffer(1e-9)

@@ -19,7 +19,7 @@ import jawusd
 from jawusd.base.errors import CaptureError, FormatError, OutputError
 from jawusd.formats.performance import SolveState
 from jawusd.geometry import transform_point, transform_points
-from jawusd.media import live_clock
+from jawusd.media import live_source
 from jawusd.media.live_source import LivePicture, LiveSource
 from jawusd.pipeline.cameras import load_cameras, open_videos
 from jawusd.pipeline.capture_inputs import open_capture
@@ -121,7 +121,7 @@ def test_a_source_that_falls_silent_is_not_waited_for(film, tmp_path):
         camera.write((tmp_path / "film.ts").read_bytes() * 4)
         camera.flush()
         source.wait_open(20.0)
-        source.play(live_clock.now_s())
+        source.play(live_source.now_s())
         with pytest.raises(CaptureError, match="has sent no image for 1 s"):
             for _ in range(200):
                 source.wait(np.inf, 0.1)
@@ -139,7 +139,7 @@ def test_files_may_begin_late(film):
     source = LiveSource(film, (64, 48), -30.0)
     source.open()
     source.wait_open(1e-9)
-    source.play(live_clock.now_s())
+    source.play(live_source.now_s())
     source.refuse_silence(1e-9)
     source.stop()
 
@@ -234,8 +234,8 @@ def patient_film(monkeypatch):
             moved.notify_all()
         return wait(source, after_s, timeout_s)
 
-    monkeypatch.setattr(live_clock, "now_s", lambda: shown[0])
-    monkeypatch.setattr(live_clock, "wait_until", wait_until)
+    monkeypatch.setattr(live_source, "now_s", lambda: shown[0])
+    monkeypatch.setattr(live_source, "wait_until", wait_until)
     monkeypatch.setattr(LiveSource, "wait", asked)
     yield
     shown[0] = np.inf

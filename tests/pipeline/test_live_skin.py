@@ -13,7 +13,7 @@ from example_people import person
 import jawusd
 from jawusd.base.errors import FittingError, FormatError
 from jawusd.formats.performance import SolveState
-from jawusd.media import live_clock
+from jawusd.media import live_source
 from jawusd.pipeline.live_frame import LiveJaw
 from jawusd.pipeline.live_skin import LiveSkin, columns_between
 from jawusd.pipeline.solve_videos import SkinOptions
@@ -146,12 +146,12 @@ def test_a_face_is_followed_while_it_is_written(learned, options, tmp_path, pipe
         os.mkfifo(path)
     else:
         path.write_text("")
-    began = live_clock.now_s()
+    began = live_source.now_s()
 
     def write():
         with open(path, "a", encoding="utf-8") as file:
             file.write(HEADER + "\n")
-            while (t := live_clock.now_s() - began) < 0.5:
+            while (t := live_source.now_s() - began) < 0.5:
                 line = lines([5000.0 + t], skin_at(rig, motion(np.array([t])), rng))[0]
                 for part in (line[:30], line[30:]):
                     file.write(part)
@@ -165,14 +165,14 @@ def test_a_face_is_followed_while_it_is_written(learned, options, tmp_path, pipe
     face.play(began, 10.0)
     unknown = LiveJaw(np.zeros(3), 100 * np.eye(3), SolveState.CARRIED)
     told = []
-    while (at := live_clock.now_s()) < began + 0.45:
+    while (at := live_source.now_s()) < began + 0.45:
         told.append((at - began, face.fuse(at, unknown, 1 / FPS)))
     by_skin = [(t, jaw) for t, jaw in told if jaw.state == SolveState.SKIN]
     assert by_skin
     for t, jaw in by_skin:
         assert np.abs(jaw.d - motion(np.array([t]))[0]).max() < 2.0
-    time.sleep(max(0.0, began + 0.9 - live_clock.now_s()))
-    silent = face.fuse(live_clock.now_s(), unknown, 1 / FPS)
+    time.sleep(max(0.0, began + 0.9 - live_source.now_s()))
+    silent = face.fuse(live_source.now_s(), unknown, 1 / FPS)
     assert silent.state == SolveState.CARRIED and silent.familiar is None
     face.stop()
     writer.join()
@@ -191,7 +191,7 @@ def test_a_face_that_never_comes_or_goes_back_is_refused(learned, tmp_path):
     with pytest.raises(FormatError, match="line 3 is not later than the row before"):
         back.play(0.0, 5.0)
         for _ in range(50):
-            back.fuse(live_clock.now_s(), LiveJaw(np.zeros(3), np.eye(3), SolveState.CARRIED), 0.04)
+            back.fuse(live_source.now_s(), LiveJaw(np.zeros(3), np.eye(3), SolveState.CARRIED), 0.04)
     back.stop()
 
 

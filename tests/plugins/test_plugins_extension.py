@@ -9,8 +9,7 @@ from pathlib import PurePosixPath
 
 import pytest
 
-from jawusd.plugins.extension import build_extension
-from jawusd.plugins.vendoring import vendored_files
+from jawusd.plugins.extension import build_extension, vendored_files
 
 
 def test_zip_holds_manifest_modules_and_reader(tmp_path):
@@ -18,7 +17,7 @@ def test_zip_holds_manifest_modules_and_reader(tmp_path):
     assert first.read_bytes() == second.read_bytes()
     with zipfile.ZipFile(first) as archive:
         names = set(archive.namelist())
-        own = {f"{name}.py" for name in ("__init__", "bake", "handle", "jaw", "operators", "panel", "scene")}
+        own = {f"{name}.py" for name in ("__init__", "bake", "handle", "jaw", "panel", "scene")}
         own |= {"blender_manifest.toml", "vendored.py", "vendored_usd.py"}
         assert {name for name in names if "/" not in name} == own
         assert {"jawusd/evaluator/rig.py", "jawusd/rig/animation.py", "jawusd/plugins/jawusd_reader.py"} <= names

@@ -13,7 +13,7 @@ from run_jawusd import run
 from viewed_example import EXAMPLE, record_build
 
 from jawusd.base.errors import CaptureError
-from jawusd.evaluator.interpolation import interpolate_smooth
+from jawusd.evaluator.authoring import interpolate_smooth
 from jawusd.evaluator.motions import motions_of_poses
 from jawusd.formats.keys import load_keys
 from jawusd.formats.poses import read_parameters

@@ -13,7 +13,7 @@ from jawusd.base.errors import RigError
 from jawusd.formats.mesh import crown_face_mask
 from jawusd.geometry import make_transform
 from jawusd.rig.animation import write_animation
-from jawusd.rig.author import decoder_layer, interface_layer
+from jawusd.rig.bake import decoder_layer, interface_layer
 from jawusd.rig.geo import build_geometry, linear_from_srgb
 from jawusd.rig.glb import write_glb
 from jawusd.rig.layers import write_layer

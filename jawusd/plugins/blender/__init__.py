@@ -10,7 +10,7 @@ from collections.abc import Mapping
 
 import bpy
 
-from . import bake, handle, jaw, operators, panel, scene, vendored
+from . import bake, handle, jaw, panel, scene, vendored
 
 
 class JawUsdHook(bpy.types.USDHook):
@@ -45,7 +45,6 @@ def register() -> None:
     import pxr.Usd  # noqa: F401
 
     bpy.utils.register_class(JawUsdHook)
-    operators.register()
     panel.register()
     jaw.register()
     handle.register()
@@ -56,5 +55,4 @@ def unregister() -> None:
     handle.unregister()
     jaw.unregister()
     panel.unregister()
-    operators.unregister()
     bpy.utils.unregister_class(JawUsdHook)

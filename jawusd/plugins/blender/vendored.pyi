@@ -1,4 +1,4 @@
-# The names of jawusd that the extension uses. `jawusd.plugins.vendoring` turns this stub into a module of the zip, and
+# The names of jawusd that the extension uses. `jawusd.plugins.extension` turns this stub into a module of the zip, and
 # adds the modules that it imports.
 
 from jawusd.base.arrays import Array as Array

@@ -7,7 +7,7 @@ from scipy.interpolate import RegularGridInterpolator
 from scipy.linalg import expm
 
 from jawusd.evaluator import JawRig
-from jawusd.evaluator.table import SampledTable
+from jawusd.rig.table import DecoderTable
 
 RIG = JawRig(example_arrays(), example_meta())
 
@@ -27,21 +27,21 @@ def random_d(count, seed=0):
 
 def test_twist_is_scipys_linear_interpolation():
     knots, twists = sampled()
-    table = SampledTable(knots, twists, RIG.T_rest)
+    table = DecoderTable("grid", knots, twists)
     d = np.concatenate([random_d(3000), [[k[0] for k in knots], [k[-1] for k in knots], [k[3] for k in knots]]])
     np.testing.assert_allclose(table.twist(d), RegularGridInterpolator(knots, twists)(d), atol=1e-12)
 
 
 def test_pose_is_the_exponential_of_the_twist():
     knots, twists = sampled()
-    table = SampledTable(knots, twists, RIG.T_rest)
+    table = DecoderTable("grid", knots, twists)
     d = random_d(20)
-    for x, T in zip(d, table.pose(d)):
-        w1, w2, w3, *v = table.twist(x)
+    for x, T in zip(d, table.pose(d, RIG.T_rest)):
+        w1, w2, w3, *v = table.twist(x[None])[0]
         generator = np.zeros((4, 4))
         generator[:3] = [[0, -w3, w2, v[0]], [w3, 0, -w1, v[1]], [-w2, w1, 0, v[2]]]
         np.testing.assert_allclose(T, expm(generator) @ RIG.T_rest, atol=1e-11)
-        np.testing.assert_allclose(table.pose(x), T, atol=1e-12)
+        np.testing.assert_allclose(table.pose(x[None], RIG.T_rest)[0], T, atol=1e-12)
 
 
 def test_a_finer_table_comes_closer_to_the_model():
@@ -49,8 +49,8 @@ def test_a_finer_table_comes_closer_to_the_model():
     d = random_d(2000)
     errors = []
     for counts in ((9, 9, 9), (17, 17, 17), (33, 33, 33)):
-        table = SampledTable(*sampled(counts, uneven=False), RIG.T_rest)
-        difference = (table.pose(d) - RIG.pose(d))[:, :3]
+        table = DecoderTable("grid", *sampled(counts, uneven=False))
+        difference = (table.pose(d, RIG.T_rest) - RIG.pose(d))[:, :3]
         landmarks = np.column_stack([RIG.landmarks, np.ones(5)])
         errors.append(np.linalg.norm(difference @ landmarks.T, axis=1).max())
     assert errors[2] < 0.5 * errors[1] < 0.25 * errors[0]
@@ -59,13 +59,12 @@ def test_a_finer_table_comes_closer_to_the_model():
 
 def test_parameters_outside_are_clamped_and_nan_gives_nan():
     knots, twists = sampled()
-    table = SampledTable(knots, twists, RIG.T_rest)
-    corner = np.array([k[-1] for k in knots])
-    np.testing.assert_array_equal(table.pose(corner + 50.0), table.pose(corner))
-    np.testing.assert_allclose(table.pose(corner[None] + 50.0)[0], table.pose(corner), atol=1e-12)
-    assert np.isnan(table.pose([np.nan, 0.0, 0.0])).all()
-    assert np.isnan(table.twist([[0.0, np.inf, 0.0]])).all()
-    assert table.pose(np.empty((2, 0, 3))).shape == (2, 0, 4, 4)
+    table = DecoderTable("grid", knots, twists)
+    corner = np.array([[k[-1] for k in knots]])
+    np.testing.assert_array_equal(table.pose(corner + 50.0, RIG.T_rest), table.pose(corner, RIG.T_rest))
+    assert np.isnan(table.pose([[np.nan, 0.0, 0.0]], RIG.T_rest)).any()
+    assert np.isnan(table.twist([[np.nan, 0.0, 0.0], [0.0, np.inf, 0.0]])).all()
+    assert table.pose(np.empty((0, 3)), RIG.T_rest).shape == (0, 4, 4)
 
 
 @pytest.mark.parametrize(
@@ -79,4 +78,4 @@ def test_parameters_outside_are_clamped_and_nan_gives_nan():
 def test_tables_that_do_not_fit_are_refused(knots, message):
     counts = (2, 2, 2) if message == "shape" else tuple(len(k) for k in knots)
     with pytest.raises(ValueError, match=message):
-        SampledTable(knots, np.zeros((*counts, 6)), np.eye(4))
+        DecoderTable("grid", tuple(map(np.array, knots)), np.zeros((*counts, 6), np.float32))
