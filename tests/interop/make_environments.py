@@ -40,8 +40,9 @@ def make(folder, name):
         target.mkdir(parents=True, exist_ok=True)
         run("npm", "install", "--silent", "--prefix", target, *NODE_PACKAGES[name])
         return
-    venv.create(target, with_pip=True)
-    pip = [target / "bin" / "python", "-m", "pip", "install", "--quiet", "--disable-pip-version-check"]
+    venv.create(target)  # without pip: the one of this Python installs into it
+    pip = [sys.executable, "-m", "pip", "--python", target / "bin" / "python"]
+    pip += ["install", "--quiet", "--disable-pip-version-check"]
     run(*pip, *PYTHON_PACKAGES[name])
     if name in WITHOUT_DEPENDENCIES:
         run(*pip, "--no-deps", *WITHOUT_DEPENDENCIES[name])
