@@ -137,7 +137,7 @@ def run_stages(run: Workspace, options: BuildOptions, tell: Callable[[Finding], 
     """Run the stages of a build in order, or reuse them.
 
     Each stage is declared with the parts of the capture and the settings that it depends on. File contents are hashed,
-    but not paths, so that a capture may be moved.
+    but not paths, so that a capture may be moved; the report alone depends on its path, which it records.
     """
     capture, videos = run.capture, run.hashes(["videos"])
     names = [camera.name for camera in capture.cameras]
@@ -172,9 +172,9 @@ def run_stages(run: Workspace, options: BuildOptions, tell: Callable[[Finding], 
     settings = [fit.outputs, refine.outputs, track.inputs, options.prim_name]
     bake = run.run(BAKE, ["skull"], settings, lambda: _bake(run, options))
 
-    missing = missing_packages()
-    settings = [bake.outputs, bake.inputs, videos, sync.result, missing]
-    report = run.run(REPORT, [], settings, lambda: _report(run, options, missing))
+    missing, place = missing_packages(), relative_capture_path(capture, run.folder)
+    settings = [bake.outputs, bake.inputs, videos, sync.result, missing, place]
+    report = run.run(REPORT, [], settings, lambda: _report(run, options, missing, place))
 
     written = [stage.outputs for stage in (scans, calibration, track, fit, refine, bake, report) if stage]
     return {
@@ -257,8 +257,8 @@ def _bake(run: Workspace, options: BuildOptions) -> tuple[list[Path], dict[str, 
     return [*files, *take], {}
 
 
-def _report(run: Workspace, options: BuildOptions, missing: str | None) -> tuple[list[Path], ReportSummary]:
-    place, origin = relative_capture_path(run.capture, run.folder), origin_now(options.command)
+def _report(run: Workspace, options: BuildOptions, missing: str | None, place: str) -> tuple[list[Path], ReportSummary]:
+    origin = origin_now(options.command)
     if missing is not None:
         # The rig is complete without a report; the summary lists the missing packages.
         return [], {"capture": place, "origin": asdict(origin), "missing": missing}

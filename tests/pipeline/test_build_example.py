@@ -144,6 +144,17 @@ def test_resume_redoes_only_what_depends_on_a_change(built, tmp_path, monkeypatc
     assert (out / "model.npz").read_bytes() == (built[0] / "model.npz").read_bytes()
 
 
+def test_a_resumed_copy_of_a_build_records_its_own_path_to_the_capture(built, tmp_path, monkeypatch):
+    monkeypatch.setattr("jawusd.pipeline.build.missing_packages", lambda: "no report: nothing here reads it")
+    source = built[0]
+    for out in (tmp_path / "copy", tmp_path / "deeper" / "copy"):
+        shutil.copytree(source, out)
+        again = build(EXAMPLE, out, BuildOptions(resume=True), quiet)
+        assert (out / again["report"]["capture"]).resolve() == EXAMPLE.resolve()
+        source = out
+    assert again["reused"] == ["check", "sync", "track", "fit", "refine", "bake"]
+
+
 @pytest.fixture
 def capture(tmp_path):
     """A copy of the example for tests that damage files; large ones are links until replaced."""
