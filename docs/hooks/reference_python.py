@@ -1,9 +1,9 @@
 """The pages of the Python API: one directive of mkdocstrings per package or module."""
 
 STAGES = (
-    "build", "track", "fit", "bake", "check", "calibrate", "segment", "scans", "photographs", "solve", "live", "report",
+    "build", "track", "fit", "bake", "check", "calibrate", "segment", "scans", "solve", "live", "report",
     "library", "many", "start_capture", "doctor", "cameras",
-    "subject", "capture_inputs", "skin",
+    "subject", "workspace", "skin",
 )  # fmt: skip
 
 PAGES = {
@@ -33,7 +33,7 @@ PAGES = {
             "jawusd.fitting.face_judging",
             "jawusd.fitting.skin",
             "jawusd.tracking",
-            "jawusd.photographs",
+            "jawusd.photographs.align",
         ],
     ),
     "geometry": ("Rotations, rigid motions, cameras and the anatomical frame.", ["jawusd.geometry"]),

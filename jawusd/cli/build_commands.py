@@ -133,8 +133,8 @@ def track(
     from jawusd.cli.text_build import track_lines
     from jawusd.formats.model import load_model
     from jawusd.pipeline import track as stage
-    from jawusd.pipeline.capture_inputs import open_capture
     from jawusd.pipeline.pictures import overlay_files
+    from jawusd.pipeline.workspace import open_capture
 
     _check_backend(solver, backend)
     refuse_existing(out, force)

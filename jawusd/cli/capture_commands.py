@@ -47,7 +47,7 @@ def calibrate(
     from jawusd.cli.text_capture import calibration_lines
     from jawusd.formats.atomic import write_text_atomic
     from jawusd.pipeline.calibrate import calibrate_boards
-    from jawusd.pipeline.capture_inputs import open_capture
+    from jawusd.pipeline.workspace import open_capture
 
     for path in (out, report_file):
         if path is not None:
@@ -89,7 +89,7 @@ def sync(
         write_light_curves,
         write_sync_plot,
     )
-    from jawusd.pipeline.capture_inputs import open_capture
+    from jawusd.pipeline.workspace import open_capture
 
     if plot is not None and plot.suffix.lower() not in PLOT_SUFFIXES:
         raise typer.BadParameter(f"--plot {plot} must end in {' or '.join(PLOT_SUFFIXES)}.")
@@ -152,9 +152,9 @@ def segment(
     """Make masks of the teeth of both jaws from the videos, starting from picks or, without picks, from a search."""
     from jawusd.cli.text_capture import segment_lines
     from jawusd.pipeline.calibrate import sync_cameras
-    from jawusd.pipeline.capture_inputs import open_capture
     from jawusd.pipeline.segment import SegmentOptions, segment_teeth
     from jawusd.pipeline.segment_record import RECORD, write_summary
+    from jawusd.pipeline.workspace import open_capture
 
     if not resume:
         _refuse_masks(out, out / RECORD, force)
@@ -220,8 +220,8 @@ def plates(
     from jawusd.base.errors import OutputError
     from jawusd.formats.tracks import load_tracks
     from jawusd.pipeline.calibrate import sync_cameras
-    from jawusd.pipeline.capture_inputs import open_capture
     from jawusd.pipeline.pictures import write_plates
+    from jawusd.pipeline.workspace import open_capture
 
     if (rig / "plates").exists() and not force:
         raise OutputError("exists already.", path=rig / "plates", hint="Overwrite its images with --force.")
@@ -257,7 +257,7 @@ def photos(
     """
     from jawusd.base.errors import TrackingError
     from jawusd.cli.text_capture import photograph_lines
-    from jawusd.pipeline.photographs import align_photograph_files
+    from jawusd.photographs.align import align_photograph_files
 
     with progress() as report:
         found = align_photograph_files(outlines, upper_teeth, lower_teeth, out, force=force, progress=report)

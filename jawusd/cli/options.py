@@ -251,8 +251,8 @@ def subject_given(
         typer.BadParameter: the options describe no subject, or several.
         JawusdError: a file cannot be read.
     """
-    from jawusd.pipeline.capture_inputs import open_capture
     from jawusd.pipeline.subject import subject_of_capture, subject_of_landmarks, subject_of_scans
+    from jawusd.pipeline.workspace import open_capture
 
     files = {"upper_teeth": upper_teeth, "lower_teeth": lower_teeth, "mandible": mandible}
     scans = {key: path for key, path in files.items() if path is not None}

@@ -18,9 +18,10 @@ from jawusd.formats.finding import Finding
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from jawusd.pipeline.live_frame import LiveFrame, OscSender
+    from jawusd.pipeline.live import OscSender
+    from jawusd.pipeline.live_jaw import LiveFrame
+    from jawusd.pipeline.skin import SkinOptions
     from jawusd.pipeline.solve import SolveSummary
-    from jawusd.pipeline.solve_videos import SkinOptions
     from jawusd.viewer.server import Viewer
 
 
@@ -162,7 +163,7 @@ def _skin_options(
     only: bool = False,
 ) -> SkinOptions | None:
     """Return the options about facial skin; None without it."""
-    from jawusd.pipeline.solve_videos import SkinOptions
+    from jawusd.pipeline.skin import SkinOptions
 
     if skin is not None and face is not None:
         return SkinOptions(skin, face, fps, offset_s, unit.value, rigid_bodies(rigid), rest_frame, only)
@@ -248,8 +249,8 @@ def live(
     Frames are dropped if images arrive faster than they are tracked; every line contains the latency. With --skin and
     --face, frames with hidden teeth are estimated from facial skin.
     """
+    from jawusd.pipeline.live import OscSender
     from jawusd.pipeline.live import live as follow
-    from jawusd.pipeline.live_frame import OscSender
     from jawusd.pipeline.view import open_viewer
 
     given = _skin_options(skin, face, face_fps, offset, rigid, rest_frame, length_unit)

@@ -13,9 +13,9 @@ from jawusd.formats.finding import Finding
 
 if TYPE_CHECKING:
     from jawusd.geometry import Camera
+    from jawusd.photographs.align import PhotographFiles
     from jawusd.pipeline.calibrate import CalibrationSummary, SyncResult
     from jawusd.pipeline.doctor import Examined
-    from jawusd.pipeline.photographs import PhotographFiles
     from jawusd.pipeline.scans import ScansSummary
     from jawusd.pipeline.segment_record import SegmentSummary
     from jawusd.pipeline.start_capture import CaptureStart

@@ -13,8 +13,7 @@ from scipy.ndimage import distance_transform_edt
 
 from jawusd.base.arrays import Array
 from jawusd.geometry import anatomical_frame, make_transform, se3_inverse, so3_exp
-from jawusd.photographs.crowns import Crowns, draw_teeth, outlines_of, split_teeth
-from jawusd.photographs.drawing import Drawing
+from jawusd.photographs.drawing import Crowns, Drawing, draw_teeth, outlines_of, split_teeth
 from jawusd.photographs.solve import Aligner, Bite, Contact, Photo, PhotoPose
 from jawusd.tracking.contour.scan import Scan, thinned
 

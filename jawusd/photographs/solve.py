@@ -14,8 +14,7 @@ from scipy.spatial import cKDTree
 
 from jawusd.base.arrays import Array
 from jawusd.geometry import orthonormalise, so3_log, transform_point, transform_points
-from jawusd.photographs.crowns import Crowns, Outlines, draw_teeth, outlines_of
-from jawusd.photographs.drawing import Drawing, features, nearest
+from jawusd.photographs.drawing import Crowns, Drawing, Outlines, draw_teeth, features, nearest, outlines_of
 from jawusd.tracking.contour.equations import motion_about
 from jawusd.tracking.contour.scan import Scan
 from jawusd.tracking.initialization.occlusion import crown_surface

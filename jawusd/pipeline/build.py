@@ -18,7 +18,6 @@ from jawusd.formats.tracks import load_tracks, save_tracks
 from jawusd.pipeline.bake import bake_subject, write_take
 from jawusd.pipeline.calibrate import CalibrationSummary, SyncResult, calibrate_boards, sync_cameras
 from jawusd.pipeline.cameras import rescaled_cameras
-from jawusd.pipeline.capture_inputs import open_capture
 from jawusd.pipeline.check import check_capture, refuse_errors
 from jawusd.pipeline.fit import FitSummary, fit_subject, fit_summary
 from jawusd.pipeline.report import (
@@ -34,7 +33,7 @@ from jawusd.pipeline.segment_record import delete_masks
 from jawusd.pipeline.state import CALIBRATION, FIRST_PASS, LABELS, Progress, StageRecord, no_progress, origin_now
 from jawusd.pipeline.subject import subject_of_capture
 from jawusd.pipeline.track import TrackSummary, first_pass, model_pass, track_summary
-from jawusd.pipeline.workspace import DryWorkspace, Stage, StageMissing, Workspace, check_folder, opened
+from jawusd.pipeline.workspace import DryWorkspace, Stage, StageMissing, Workspace, check_folder, open_capture, opened
 
 OLD_MASKS = "masks"  # folder to which version 0.1 wrote masks if the capture named no mask folder
 

@@ -20,6 +20,7 @@ from jawusd.pipeline.subject import load_meshes, registered_meshes
 if TYPE_CHECKING:
     from jawusd.media.clip import Clip
     from jawusd.media.overlay import Backdrop
+    from jawusd.segmentation.picture import ColourFootage
 
 
 Size = tuple[int, int]
@@ -220,6 +221,29 @@ def open_footage(capture: Capture, tracks: Tracks | None = None) -> tuple[dict[s
     cameras = load_cameras(capture)
     placed = cameras if tracks is None else tracked_cameras(cameras, tracks)
     return {camera.name: camera for camera in placed}, open_videos(capture)
+
+
+def open_colour_footage(
+    capture: Capture, offsets: Mapping[str, int], work: str | None = None
+) -> tuple[dict[str, Camera], ColourFootage]:
+    """Return the calibrated cameras of a capture that have a video, by name, and their images.
+
+    Args:
+        offsets: frame offset by camera.
+        work: what the footage is for, in words, if that needs two cameras.
+
+    Raises:
+        CaptureError, CalibrationError: see `open_footage`; or fewer than two cameras have a video.
+    """
+    from jawusd.segmentation.picture import ColourFootage
+
+    cameras, videos = open_footage(capture)
+    if work is not None and len(videos) < 2:
+        raise CaptureError(
+            f"{len(videos)} of {len(capture.cameras)} cameras have a video; {work} needs at least two.",
+            path=capture.folder / "capture.toml",
+        )
+    return {name: camera for name, camera in cameras.items() if name in videos}, ColourFootage(videos, offsets)
 
 
 @explain_missing_packages()

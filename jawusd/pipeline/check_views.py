@@ -75,7 +75,7 @@ def synchronisation(parts: Parts) -> Iterator[Finding]:
 
 def frames(parts: Parts) -> Iterator[Finding]:
     """Check that the frame numbers given in the capture exist."""
-    from jawusd.capture.mask_checks import swapped_cameras
+    from jawusd.capture.camera_checks import swapped_cameras
 
     capture = parts.given
     count = _frame_count(parts, capture.reference)
@@ -137,7 +137,7 @@ def _mask_ranges(parts: Parts, first: int, stop: int) -> Iterator[Finding]:
 
 def views(parts: Parts) -> Iterator[Finding]:
     """Check that the views of all cameras agree on the position and size of the teeth."""
-    from jawusd.capture.mask_checks import centre_findings, width_findings
+    from jawusd.capture.camera_checks import centre_findings, width_findings
 
     reference = parts.samples.get(parts.given.reference)
     if reference is None or reference.first_frame is None:

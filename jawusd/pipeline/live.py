@@ -13,21 +13,21 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 import jawusd
-from jawusd.base.errors import CaptureError, explain_missing_packages, naming_file
+from jawusd.base.errors import CaptureError, OutputError, explain_missing_packages, naming_file
 from jawusd.evaluator import JawRig
 from jawusd.formats.capture import Capture
 from jawusd.formats.performance import SolveState
 from jawusd.media import live_source
 from jawusd.pipeline.calibrate import sync_cameras
 from jawusd.pipeline.cameras import load_cameras
-from jawusd.pipeline.capture_inputs import open_capture
-from jawusd.pipeline.follow import Cutter
-from jawusd.pipeline.live_frame import LiveFrame, LiveJaw
-from jawusd.pipeline.live_skin import LiveSkin
+from jawusd.pipeline.live_jaw import LiveFrame, LiveJaw, LiveSkin
 from jawusd.pipeline.picture_search import LEAST_FIT, arches_apart, masked_cameras, orientations
-from jawusd.pipeline.solve_videos import PreparedTeeth, SkinOptions, VideoOptions, VideoShot
+from jawusd.pipeline.skin import SkinOptions
+from jawusd.pipeline.solve_videos import PreparedTeeth, VideoOptions, VideoShot
 from jawusd.pipeline.state import no_progress
 from jawusd.pipeline.subject import load_labelled, registered_meshes
+from jawusd.pipeline.track_videos import Cutter
+from jawusd.pipeline.workspace import open_capture
 
 if TYPE_CHECKING:
     from jawusd.media.live_source import LiveSource
@@ -84,6 +84,60 @@ def live(
         follower = _Follower(capture, jaw, sources or {}, fixed_head, pool, skin)
         stack.callback(follower.stop)
         yield from follower.run(seconds, silence_s)
+
+
+class OscSender:
+    """Sends one OSC bundle per frame over UDP.
+
+    Arguments: /jaw/d and /jaw/sigma have three floats [mm], /jaw/margin one [mm], /jaw/time one [s]. /jaw/state has the
+    integer 1 for solved, 2 for carried or 3 for skin, as in `SolveState`. /jaw/familiar, sent only if `familiar` is
+    known, has 1 or 0.
+    """
+
+    @explain_missing_packages()
+    def __init__(self, address: str) -> None:
+        """Open a socket for HOST:PORT.
+
+        Raises:
+            OutputError: the address has no port, or the host is unknown.
+            MissingDependencyError: python-osc is not installed.
+        """
+        from pythonosc.udp_client import UDPClient
+
+        host, _, port = address.rpartition(":")
+        if not host or not port.isdecimal() or not 0 < int(port) < 65536:
+            raise OutputError(f"{address!r} is not an address.", hint="Give HOST:PORT, for example 127.0.0.1:9000.")
+        try:
+            self._client = UDPClient(host.strip("[]"), int(port))
+        except OSError as error:
+            raise OutputError(f"unknown host {host!r} ({error}).") from error
+
+    def close(self) -> None:
+        """Close the socket."""
+        self._client.close()
+
+    @explain_missing_packages()
+    def send(self, frame: LiveFrame) -> None:
+        """Send one result; it is not an error if nothing receives it."""
+        from pythonosc.osc_bundle_builder import IMMEDIATELY, OscBundleBuilder
+        from pythonosc.osc_message_builder import build_msg
+
+        bundle = OscBundleBuilder(IMMEDIATELY)
+        values: dict[str, list[float] | list[int]] = {
+            "d": frame.d.tolist(),
+            "sigma": frame.sigma.tolist(),
+            "margin": [frame.margin_mm],
+            "state": [int(SolveState[frame.state.upper()])],
+            "time": [frame.time_s],
+        }
+        if frame.familiar is not None:
+            values["familiar"] = [int(frame.familiar)]
+        for name, numbers in values.items():
+            bundle.add_content(build_msg(f"/jaw/{name}", numbers))
+        try:
+            self._client.send(bundle.build())
+        except OSError:  # the receiver has closed its port and may open it again
+            return
 
 
 def next_instant(times_s: Sequence[Sequence[float]], after_s: float) -> float | None:

@@ -6,13 +6,13 @@ import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Generic, TypeVar
+from typing import TYPE_CHECKING, Generic, Protocol, TypeVar
 
 import numpy as np
 
 from jawusd.base.arrays import Array
 from jawusd.base.errors import TrackingError
-from jawusd.formats.capture import CameraSource, Capture
+from jawusd.formats.capture import Bootstrap, CameraSource, Capture
 from jawusd.geometry import Camera, se3_inverse
 from jawusd.pipeline.segment_record import with_masks
 from jawusd.pipeline.state import Progress
@@ -45,6 +45,18 @@ LEAST_FIT, _CLEAR_FIT, _CLEAR_FIT_SINGLE = 0.15, 0.25, 0.4
 T = TypeVar("T")
 
 
+class StartInFrame(Protocol[T]):
+    """An estimate of the pose in one frame; see `tracking.region.picture_start`."""
+
+    def at(
+        self, sources: Sequence[CameraSource], cameras: Mapping[str, Camera], offsets: Mapping[str, int], frame: int
+    ) -> T | None:
+        """Return the most likely pose in a frame with rough masks, or None."""
+
+    def picked(self, bootstrap: Bootstrap, cameras: Mapping[str, Camera]) -> T:
+        """Return the pose from picks in two or more cameras."""
+
+
 @dataclass(frozen=True, eq=False)
 class Start(Generic[T]):
     """A start of tracking: frame, pose, fraction of the visible contour that fits, and how it was found."""
@@ -70,12 +82,13 @@ class _Candidate:
 
 @dataclass(frozen=True, eq=False)
 class PictureSearch(Generic[T]):
-    """A search for the teeth in footage, without masks.
+    """A search for the teeth in footage, without masks, or at picks.
 
     Attributes:
         capture, footage: the capture, and the images of those of its cameras that have a video.
         cameras: the calibrated cameras that have a video, by name.
-        near: function that estimates the pose in a frame from cameras with rough masks; returns None if that fails.
+        offsets: frame offset by camera.
+        near: estimates the pose in a frame from rough masks or picks.
         judged: function that refines a pose in a frame; returns the pose and the fraction of the visible contour that
             fits, 0 .. 1.
     """
@@ -83,7 +96,8 @@ class PictureSearch(Generic[T]):
     capture: Capture
     footage: ColourFootage
     cameras: Mapping[str, Camera]
-    near: Callable[[Sequence[CameraSource], int], T | None]
+    offsets: Mapping[str, int]
+    near: StartInFrame[T]
     judged: Callable[[int, T], tuple[T, float]]
 
     def run(self, frames: range, progress: Progress, up_world: Array | None = None) -> Start[T]:
@@ -144,8 +158,31 @@ class PictureSearch(Generic[T]):
         numbers = {name: number for name, number in known.items() if number is not None}
         with tempfile.TemporaryDirectory() as folder:
             masked = masked_cameras(self.capture, candidate.rows, numbers, Path(folder))
-            near = self.near(masked, candidate.frame)
+            near = self.near.at(masked, self.cameras, self.offsets, candidate.frame)
         return None if near is None else Start(candidate.frame, *self.judged(candidate.frame, near), "search")
+
+    def picked(self, picks: Bootstrap, frames: range, least_fit: float) -> Start[T]:
+        """Return a start of tracking from picks.
+
+        Args:
+            frames: range to be tracked.
+            least_fit: minimum fraction of the visible contour that fits for the start to be accepted.
+
+        Raises:
+            TrackingError: the frame is outside the range, or the picks are inconsistent or do not match the images.
+            CaptureError: an image cannot be decoded.
+        """
+        if picks.frame not in frames:
+            raise picks_outside(picks.frame, frames)
+        pose, fit = self.judged(picks.frame, self.near.picked(picks, self.cameras))
+        if fit < least_fit:
+            raise TrackingError(
+                f"the picks do not match the images: {fit:.0%} of the visible contour agrees with the image "
+                f"colours; at least {least_fit:.0%} is needed",
+                frame=picks.frame,
+                hint="Check the picks, and that scans, rig and calibration belong to this subject and these cameras.",
+            )
+        return Start(picks.frame, pose, fit, "picks")
 
 
 def upright_turns(cameras: Mapping[str, Camera], up_world: Array) -> dict[str, int]:
@@ -216,31 +253,6 @@ def masked_cameras(
         for arch, mask in zip(ARCHES, found.masks, strict=True):
             write_mask(mask_path(folder, name, arch, numbers[name]), mask)
     return [camera for camera in with_masks(capture, folder).cameras if camera.name in rows]
-
-
-def picked_start(picked_frame: int, frames: range, begin: Callable[[], tuple[T, float]], least_fit: float) -> Start[T]:
-    """Return a start of tracking from picks.
-
-    Args:
-        picked_frame: frame of the picks.
-        frames: range to be tracked.
-        begin: returns the pose estimated from the picks, and the fraction of the visible contour that fits it, 0 .. 1.
-        least_fit: minimum fraction for the start to be accepted.
-
-    Raises:
-        TrackingError: the frame is outside the range, or the picks do not match the images.
-    """
-    if picked_frame not in frames:
-        raise picks_outside(picked_frame, frames)
-    pose, fit = begin()
-    if fit < least_fit:
-        raise TrackingError(
-            f"the picks do not match the images: {fit:.0%} of the visible contour agrees with the image "
-            f"colours; at least {least_fit:.0%} is needed",
-            frame=picked_frame,
-            hint="Check the picks, and that scans, rig and calibration belong to this subject and these cameras.",
-        )
-    return Start(picked_frame, pose, fit, "picks")
 
 
 def picks_outside(frame: int, frames: range) -> TrackingError:

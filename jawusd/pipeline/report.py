@@ -21,7 +21,6 @@ from jawusd.formats.notes import SyncNotes
 from jawusd.formats.report import BuildVerdict, CameraFacts, Origin, Overlay, ReportData, RigFacts
 from jawusd.formats.tracks import Tracks, load_tracks
 from jawusd.pipeline.cameras import load_cameras
-from jawusd.pipeline.capture_inputs import open_capture
 from jawusd.pipeline.contact import contact_pictures
 from jawusd.pipeline.fit import Poses, fit_summary
 from jawusd.pipeline.pictures import draw_worst_frames, replay_parts
@@ -39,6 +38,7 @@ from jawusd.pipeline.state import (
     recorded_origin,
 )
 from jawusd.pipeline.subject import Subject, subject_of_build
+from jawusd.pipeline.workspace import open_capture
 
 T = TypeVar("T")
 

@@ -16,9 +16,9 @@ from jawusd.formats.capture import Capture, Scans
 from jawusd.formats.mesh import Mesh, painted_labels, tooth_labels
 from jawusd.formats.scan_labels import ScanLabels, labels_path, save_scan_labels
 from jawusd.geometry import anatomical_frame
-from jawusd.pipeline.capture_inputs import open_capture
 from jawusd.pipeline.state import Progress, no_progress
 from jawusd.pipeline.subject import TEETH, LabelledScan, labelled_teeth, read_files
+from jawusd.pipeline.workspace import open_capture
 
 PICTURE = "scan_labels.png"
 

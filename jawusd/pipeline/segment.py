@@ -7,21 +7,18 @@ import json
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from jawusd.base.arrays import Array
-from jawusd.base.errors import CaptureError, explain_missing_packages
+from jawusd.base.errors import explain_missing_packages
 from jawusd.formats.atomic import write_text_atomic
 from jawusd.formats.capture import Capture
 from jawusd.formats.tracks import LOST
-from jawusd.pipeline.cameras import open_footage
-from jawusd.pipeline.capture_inputs import input_hashes
-from jawusd.pipeline.follow import Follower
-from jawusd.pipeline.picture_search import picks_outside
+from jawusd.pipeline.cameras import open_colour_footage
+from jawusd.pipeline.picture_search import PictureSearch, picks_outside
 from jawusd.pipeline.segment_guide import known_guide, save_guide
 from jawusd.pipeline.segment_record import (
     LEARNED,
@@ -31,7 +28,8 @@ from jawusd.pipeline.segment_record import (
 )
 from jawusd.pipeline.state import Progress, hash_files, hash_value
 from jawusd.pipeline.subject import load_meshes, subject_of_capture
-from jawusd.pipeline.track_videos import ArchSearch
+from jawusd.pipeline.track_videos import Follower
+from jawusd.pipeline.workspace import input_hashes
 
 if TYPE_CHECKING:
     from jawusd.segmentation.camera import CameraSegmenter, Segment
@@ -96,20 +94,13 @@ class _Segmentation:
     ) -> None:
         from jawusd.segmentation.colours import SegmentationConfig
         from jawusd.segmentation.files import KeyMasks
-        from jawusd.segmentation.picture import ColourFootage
         from jawusd.tracking.sequence.guided import GuidedTracker
 
         self._capture, self._folder, self._progress, self._pool = capture, folder, progress, pool
-        cameras, videos = open_footage(capture)
-        if len(videos) < 2:
-            raise CaptureError(
-                f"{len(videos)} of {len(capture.cameras)} cameras have a video; segmentation needs at least two.",
-                path=capture.folder / "capture.toml",
-            )
-        self._cameras = {name: camera for name, camera in cameras.items() if name in videos}
+        self._cameras, self._footage = open_colour_footage(capture, offsets, "segmentation")
         meshes = load_meshes(capture)
         self._meshes = meshes["upper_teeth"], meshes["lower_teeth"]
-        self._footage, self._offsets = ColourFootage(videos, offsets), offsets
+        self._offsets = offsets
         self._keys = KeyMasks(options.keys, {name: camera.size_px for name, camera in self._cameras.items()})
         self._config = SegmentationConfig()
         self._subject = subject_of_capture(capture, meshes)
@@ -154,10 +145,9 @@ class _Segmentation:
 
     def _follow(self, start: int, poses: Array) -> None:
         """Follow the teeth through all frames by their colours, starting from the poses in one frame."""
-        follower = Follower(self._footage, self._cameras, self._tracker.scans, self._subject, self._pool)
+        follower, search = self._follower()
         follower.start_at(start, poses)
-        find = partial(self._search(follower).run, progress=self._progress)
-        self._guide = follower.run(range(self._first, self._stop), find, self._progress)
+        self._guide = follower.run(range(self._first, self._stop), search, self._progress)
         save_guide(self._folder, self._guide_inputs, self._guide)
 
     def _find_start(self) -> tuple[int, Array]:
@@ -176,18 +166,20 @@ class _Segmentation:
         if self._journal.entries and self._guide:
             self._start = next(iter(self._journal.entries))  # the first recorded frame is the start
             return self._start, self._guide[self._start].poses
-        follower = Follower(self._footage, self._cameras, self._tracker.scans, self._subject, self._pool)
-        begin = self._search(follower).run(frames, None, self._progress)
+        _, search = self._follower()
+        begin = search.run(frames, self._progress)
         self._start = begin.frame
         return begin.frame, begin.pose
 
-    def _search(self, follower: Follower) -> ArchSearch:
-        """Return a search for the teeth that uses a follower to refine poses."""
+    def _follower(self) -> tuple[Follower, PictureSearch[Array]]:
+        """Return a tracker by colours, and a search for the teeth that uses it to refine poses."""
         from jawusd.tracking.region.picture_start import ArchStart
 
+        follower = Follower(self._footage, self._cameras, self._tracker.scans, self._subject, self._pool)
         upper, lower = self._tracker.scans
         rows = ArchStart(self._meshes, (upper, lower), self._capture.anatomy.T_anatomical_skull, self._pool.map)
-        return ArchSearch(self._capture, self._offsets, self._footage, rows, follower)
+        footage = self._capture, self._footage, self._cameras, self._offsets
+        return follower, PictureSearch(*footage, rows, follower.start_at)
 
     def _advance(self, stage_name: str, done: int) -> None:
         self._progress(stage_name, done, self._stop - self._first)

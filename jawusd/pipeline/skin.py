@@ -29,6 +29,29 @@ _LISTED = 8  # number of missing columns that a message names
 _LARGEST_SIGMA_MM = 1.0  # standard deviation at the incisal point above which a pose does not count as seen
 
 
+@dataclass(frozen=True)
+class SkinOptions:
+    """Facial-skin inputs of `solve`.
+
+    Attributes:
+        skin: the map from skin to d, written by `jawusd skin-fit`.
+        face: facial motion during the shot; it has the columns from which the map was learned.
+        fps: frame rate of the face [1/s], if the file does not state it.
+        offset_s: seconds from frame 0 of the shot to frame 0 of the face data; None: estimated.
+        unit, rigid, rest_frame: see `read_face`.
+        only: whether to ignore the images of the shot.
+    """
+
+    skin: str | os.PathLike[str]
+    face: str | os.PathLike[str]
+    fps: float | None = None
+    offset_s: float | None = None
+    unit: str = "mm"
+    rigid: Mapping[str, str] | None = None
+    rest_frame: int | None = None
+    only: bool = False
+
+
 @dataclass(frozen=True, eq=False)
 class JawTake:
     """The jaw motion of a take, and the frames in which the teeth were visible.
@@ -197,6 +220,19 @@ def read_face(
     if rigid:
         points = in_head(points, face.names, rigid, rest_frame, unit, path)
     return FaceTable(face.frames, points, face.names, face.fps, "mm")
+
+
+def read_shot_face(skin: Skin, options: SkinOptions) -> tuple[Array, Array]:
+    """Return the times (F,) [s] of the face data of a shot, and the columns (F, K) from which a map was learned.
+
+    Raises:
+        FormatError: the file is invalid, or has other columns than those of the map or no frame rate.
+    """
+    face = read_face(options.face, options.fps, options.unit, options.rigid, options.rest_frame)
+    columns = own_columns(skin, options.skin, face, options.face)
+    if not face.fps:
+        raise FormatError("does not state its frame rate.", path=options.face, hint="Give it with --face-fps.")
+    return face.frames / face.fps, columns.reshape(len(columns), -1)
 
 
 def read_blend_face(path: str | os.PathLike[str], fps: float | None = None) -> FaceTable:

@@ -22,14 +22,15 @@ from jawusd.formats.performance import Performance, SolveState, write_performanc
 from jawusd.formats.tracks import save_tracks
 from jawusd.pipeline.calibrate import sync_cameras
 from jawusd.pipeline.cameras import load_cameras
-from jawusd.pipeline.capture_inputs import open_capture
 from jawusd.pipeline.pictures import VIDEO, write_overlay
 from jawusd.pipeline.segment_guide import combine_guide
+from jawusd.pipeline.skin import SkinOptions
 from jawusd.pipeline.solve_report import check_page, solve_limits, write_solve_report
-from jawusd.pipeline.solve_videos import SkinOptions, VideoOptions, solve_videos
+from jawusd.pipeline.solve_videos import VideoOptions, solve_videos
 from jawusd.pipeline.state import Progress, no_progress
 from jawusd.pipeline.subject import load_labelled, registered_meshes
 from jawusd.pipeline.track import tracking_config
+from jawusd.pipeline.workspace import open_capture
 
 if TYPE_CHECKING:
     from jawusd.pipeline.solve_skin import SkinOfShot
@@ -112,8 +113,7 @@ def solve(
         TrackingError: the teeth cannot be found in the masks or the videos.
         OutputError: a file cannot be written.
     """
-    from jawusd.pipeline.skin_footage import SkinOfFootage, skin_of_footage
-    from jawusd.pipeline.solve_skin import SkinOfShot
+    from jawusd.pipeline.solve_skin import SkinOfFootage, SkinOfShot, skin_of_footage
     from jawusd.tracking.performance.results import tracks_of
 
     check_output(rig, out, overlay, report)

@@ -16,10 +16,10 @@ from jawusd.formats.report import Overlay, SolveReportData
 from jawusd.formats.tracks import Tracks, load_tracks, worst_frames
 from jawusd.pipeline.calibrate import sync_cameras
 from jawusd.pipeline.cameras import check_same_cameras, load_cameras, open_backdrops, tracked_cameras, tracked_scans
-from jawusd.pipeline.capture_inputs import open_capture
 from jawusd.pipeline.pictures import draw_frames
 from jawusd.pipeline.report import attempt, camera_facts
 from jawusd.pipeline.state import Progress, make_folder, package_versions
+from jawusd.pipeline.workspace import open_capture
 
 PAGE = ".html"
 _MOST_UNSEEN, _MOST_UNCERTAIN, _MOST_OUTSIDE = 3, 2, 2  # number of frames drawn for each reason

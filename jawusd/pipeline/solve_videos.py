@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -11,15 +10,15 @@ from typing import TYPE_CHECKING
 
 from jawusd.base.arrays import Array
 from jawusd.evaluator import JawRig
-from jawusd.formats.capture import Bootstrap, CameraSource, Capture
+from jawusd.formats.capture import Capture
 from jawusd.formats.mesh import Mesh
 from jawusd.formats.performance import Performance
 from jawusd.geometry import Camera
 from jawusd.pipeline.cameras import open_videos
-from jawusd.pipeline.follow import Cutter
-from jawusd.pipeline.picture_search import LEAST_FIT, PictureSearch, Start, picked_start
+from jawusd.pipeline.picture_search import LEAST_FIT, PictureSearch, Start
 from jawusd.pipeline.state import Progress
 from jawusd.pipeline.subject import subject_of_capture
+from jawusd.pipeline.track_videos import Cutter
 
 if TYPE_CHECKING:
     from jawusd.tracking.config import Mapper
@@ -36,29 +35,6 @@ class VideoOptions:
     free_focal: bool = False
     jobs: int = 2
     skin: SkinOf | None = None
-
-
-@dataclass(frozen=True)
-class SkinOptions:
-    """Facial-skin inputs of `solve`.
-
-    Attributes:
-        skin: the map from skin to d, written by `jawusd skin-fit`.
-        face: facial motion during the shot; it has the columns from which the map was learned.
-        fps: frame rate of the face [1/s], if the file does not state it.
-        offset_s: seconds from frame 0 of the shot to frame 0 of the face data; None: estimated.
-        unit, rigid, rest_frame: see `pipeline.skin.read_face`.
-        only: whether to ignore the images of the shot.
-    """
-
-    skin: str | os.PathLike[str]
-    face: str | os.PathLike[str]
-    fps: float | None = None
-    offset_s: float | None = None
-    unit: str = "mm"
-    rigid: Mapping[str, str] | None = None
-    rest_frame: int | None = None
-    only: bool = False
 
 
 class PreparedTeeth:
@@ -113,7 +89,7 @@ class VideoShot:
         from jawusd.tracking.region.performance import PictureShot, PictureTake
 
         videos = open_videos(capture)
-        self._capture, self._offsets, self._teeth, self._progress = capture, offsets, teeth, progress
+        self._picks, self._teeth, self._progress = capture.bootstrap, teeth, progress
         self.cameras = {name: camera for name, camera in cameras.items() if name in videos}
         self.footage = ColourFootage(videos, offsets)
         shot = PictureShot(
@@ -128,6 +104,8 @@ class VideoShot:
         )
         self._frames = shot.frames
         self.take = PictureTake(jaw, teeth.scans, teeth.axes, shot)
+        footage = capture, self.footage, self.cameras, offsets
+        self._search: PictureSearch[Pose] = PictureSearch(*footage, teeth.search, self.take.begun)
 
     def _cuts(self, placed: Sequence[Camera], centre: Array, frames: range) -> Iterator[Cut]:
         table = {camera.name: camera for camera in placed}
@@ -140,32 +118,15 @@ class VideoShot:
             TrackingError: the teeth were not found.
             CaptureError: an image cannot be decoded.
         """
-        if self._capture.bootstrap is not None and len(self.cameras) > 1:
-            return self._picked(self._capture.bootstrap)
-        return self._searched(self._frames)
+        picks = self._picks
+        if picks is not None and len(self.cameras) > 1:
+            return self._search.picked(picks, self._frames, LEAST_FIT)
+        return self._search.run(self._frames, self._progress)
 
     def _again(self, frames: range, up_world: Array) -> tuple[int, Pose]:
         """Search in frames in which the teeth were lost; `up_world` is as in `PictureSearch.run`."""
-        begin = self._searched(frames, up_world)
+        begin = self._search.run(frames, self._progress, up_world)
         return begin.frame, begin.pose
-
-    def _searched(self, frames: range, up_world: Array | None = None) -> Start[Pose]:
-        """Return a start of tracking within a range of frames; see `PictureSearch.run`."""
-
-        def near(sources: Sequence[CameraSource], frame: int) -> Pose | None:
-            return self._teeth.search.at(sources, self.cameras, self._offsets, frame)
-
-        search = PictureSearch(self._capture, self.footage, self.cameras, near, self.take.begun)
-        return search.run(frames, self._progress, up_world)
-
-    def _picked(self, bootstrap: Bootstrap) -> Start[Pose]:
-        """Return a start of tracking from the picks."""
-        frame = bootstrap.frame
-
-        def begin() -> tuple[Pose, float]:
-            return self.take.begun(frame, self._teeth.search.picked(bootstrap, self.cameras))
-
-        return picked_start(frame, self._frames, begin, LEAST_FIT)
 
 
 def solve_videos(

@@ -28,13 +28,13 @@ from jawusd.formats.tracks import (
 from jawusd.geometry import LANDMARKS
 from jawusd.pipeline.calibrate import sync_cameras
 from jawusd.pipeline.cameras import load_cameras, rescaled_cameras
-from jawusd.pipeline.capture_inputs import open_capture
 from jawusd.pipeline.pictures import write_overlay
 from jawusd.pipeline.segment_guide import combine_guide
 from jawusd.pipeline.segment_record import auto_masks_folder
 from jawusd.pipeline.state import Progress, no_progress
 from jawusd.pipeline.subject import load_labelled, load_meshes, registered_meshes, subject_of_capture
 from jawusd.pipeline.track_videos import track_videos
+from jawusd.pipeline.workspace import open_capture
 
 if TYPE_CHECKING:
     from jawusd.tracking import TrackingConfig

@@ -1,29 +1,200 @@
-"""Track captures that have no masks, using the colours of their footage."""
+"""Track the teeth of captures without masks by the colours of their footage.
+
+The teeth are followed from a start frame to both ends of the take. Where they are lost, they are searched for again.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import Executor, ThreadPoolExecutor
 from functools import partial
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from jawusd.base.arrays import Array
-from jawusd.base.errors import CaptureError
-from jawusd.formats.capture import Bootstrap, CameraSource, Capture
+from jawusd.formats.capture import Capture
 from jawusd.formats.mesh import Mesh
 from jawusd.formats.tracks import Tracks
-from jawusd.pipeline.cameras import open_footage
-from jawusd.pipeline.follow import Follower
-from jawusd.pipeline.picture_search import PictureSearch, Start, picked_start
+from jawusd.geometry import Camera, relative_pose, transform_points
+from jawusd.pipeline.cameras import open_colour_footage
+from jawusd.pipeline.picture_search import PictureSearch, Start
 from jawusd.pipeline.state import Progress
-from jawusd.pipeline.subject import subject_of_capture
+from jawusd.pipeline.subject import Subject, subject_of_capture
 
 if TYPE_CHECKING:
-    from jawusd.segmentation.picture import ColourFootage
-    from jawusd.tracking.region.picture_start import ArchStart
+    from jawusd.segmentation.picture import ColourFootage, PictureFrame, Pictures
+    from jawusd.tracking.config import Mapper
+    from jawusd.tracking.contour.scan import Scan
+    from jawusd.tracking.contour.views import View
+    from jawusd.tracking.follow import Begin
+    from jawusd.tracking.region.appearance import Cut, Picture
+    from jawusd.tracking.region.tracker import RegionPose, RegionTracker
 
-FEWEST_VIDEOS = 2
+
+_WORKING_PX_PER_MM, _MARGIN_MM = 7.2, 6.0  # resolution at the teeth, and margin around them, in cropped images
+
+
+class Cutter:
+    """Crops the images of all cameras to the teeth."""
+
+    def __init__(
+        self, cameras: Mapping[str, Camera], scans: Sequence[Scan], centre: Array, executor: Executor | None = None
+    ) -> None:
+        """Choose the working resolution of every camera.
+
+        Args:
+            cameras: calibrated cameras by name.
+            scans: upper and lower scan.
+            centre: approximate position of the teeth in the world [mm], shape (3,).
+            executor: threads for the images of all cameras.
+        """
+        from jawusd.segmentation.picture import PictureFrame
+
+        self._frames: dict[str, PictureFrame] = {
+            name: PictureFrame(camera, centre, _WORKING_PX_PER_MM) for name, camera in cameras.items()
+        }
+        self._map: Mapper = executor.map if executor else map
+        self._probes = [scan.probes for scan in scans]
+
+    def cut(self, pictures: Pictures) -> Cut:
+        """Return a function that crops the images of one video frame around given poses."""
+
+        def cut(poses: Array) -> list[Picture | None]:
+            around = np.concatenate([transform_points(T, own) for T, own in zip(poses, self._probes, strict=True)])
+            return list(self._map(lambda name: self._one(name, pictures, around), self._frames))
+
+        return cut
+
+    def walk(self, footage: ColourFootage, frames: range) -> Iterator[Cut]:
+        """Yield the function returned by `cut` for each frame.
+
+        Raises:
+            CaptureError: an image cannot be decoded.
+        """
+        return (self.cut(pictures) for _, pictures in footage.walk(frames))
+
+    def _one(self, name: str, pictures: Pictures, around: Array) -> Picture | None:
+        from jawusd.tracking.region.appearance import Picture
+
+        image = pictures[name]
+        window = None if image is None else self._frames[name].window(image, around, _MARGIN_MM)
+        return None if window is None else Picture(window.camera, window.rgb)
+
+
+_SAMPLED_VIEWS = 10  # maximum number of frames whose views are kept: a few MB
+STAGE = "follow"
+
+
+class Follower:
+    """Tracker of both arches from a start frame to both ends of a take.
+
+    Attributes:
+        cameras: the calibrated cameras that have a video, by name.
+        sampled_views: poses and views of evenly sampled frames of the last run.
+    """
+
+    def __init__(
+        self,
+        footage: ColourFootage,
+        cameras: Mapping[str, Camera],
+        scans: Sequence[Scan],
+        subject: Subject,
+        pool: Executor | None = None,
+    ) -> None:
+        """Prepare the tracker.
+
+        Args:
+            footage, cameras: the images, and the calibrated cameras by name.
+            scans: upper and lower scan, prepared for tracking.
+            subject: provides axes and condyles.
+            pool: threads for the cameras.
+        """
+        self.cameras = cameras
+        self._footage, self._scans, self._subject = footage, scans, subject
+        self._pool = pool
+        self.sampled_views: list[tuple[Array, list[View]]] = []
+        self._wanted: set[int] = set()  # frames to be sampled
+
+    def start_at(self, frame: int, poses: Array) -> tuple[Array, float]:
+        """Refine T_world_upper, T_world_lower (2, 4, 4) in the frame from which `run` will start; return them, and fit.
+
+        The fit is the fraction of the visible contour that matches the colours, 0 .. 1, for the worse arch.
+
+        Raises:
+            CaptureError: an image cannot be decoded.
+        """
+        from jawusd.tracking.contour.scan import teeth_centre
+        from jawusd.tracking.follow import Begin
+        from jawusd.tracking.region.tracker import RegionTracker
+
+        cutter = Cutter(self.cameras, self._scans, teeth_centre(self._scans, poses), self._pool)
+        axes = self._subject.T_anatomical_skull[:3, :3]
+        landmarks, cameras = self._subject.landmarks, list(self.cameras.values())
+        tracker = RegionTracker(self._scans, cameras, landmarks, axes, executor=self._pool)
+        found = tracker.begin(cutter.cut(self._footage.at(frame)), poses)
+        self._begin = Begin(frame, found, partial(self._walk, tracker, cutter))
+        return found.poses, tracker.first_fit
+
+    def start_by(
+        self, search: PictureSearch[Array], frames: range, progress: Progress, up_world: Array | None = None
+    ) -> Start[Array]:
+        """Start where a search in a range of frames finds the teeth; see `PictureSearch.run`."""
+        begin = search.run(frames, progress, up_world)
+        self.start_at(begin.frame, begin.pose)  # again, since the search may have tried other starts after this one
+        return begin
+
+    def run(self, frames: range, search: PictureSearch[Array], progress: Progress) -> dict[int, RegionPose]:
+        """Return the poses of all frames, starting from the frame last passed to `start_at`.
+
+        Args:
+            search: used where the teeth are lost for several frames; it judges poses by `start_at`.
+
+        Raises:
+            CaptureError: an image cannot be decoded.
+        """
+        from jawusd.tracking.follow import TwoWays
+
+        points, up = self._subject.landmarks[:3], self._subject.T_anatomical_skull[1, :3]
+
+        def again(lost: range, near: RegionPose) -> Begin[RegionPose]:
+            self.start_by(search, lost, progress, near.poses[0, :3, :3] @ up)
+            return self._begin
+
+        def places(found: RegionPose) -> Array:
+            return transform_points(relative_pose(*found.poses), points)
+
+        take = TwoWays(frames, places, lambda found: found.objective_px, progress=partial(progress, STAGE))
+        self.sampled_views.clear()
+        self._wanted = set(np.linspace(frames.start, frames.stop - 1, _SAMPLED_VIEWS).astype(int).tolist())
+        begin = self._begin
+        take.follow(begin)
+        take.recover(again)
+        for frame, least_mm in take.unconfirmed(begin.follow).items():
+            take.known[frame] = take.known[frame].unconfirmed(least_mm, points[0])
+        return dict(take.known)
+
+    def _walk(self, tracker: RegionTracker, cutter: Cutter, way: range, near: RegionPose) -> Iterator[RegionPose]:
+        """Yield the poses of frames in tracking order, starting next to a given pose; keep the views of some frames."""
+        cuts = _Latest(cutter.walk(self._footage, way))
+        for frame, found in zip(way, tracker.follow(cuts, near.poses), strict=True):
+            if frame in self._wanted and found.found.all():
+                self._wanted.remove(frame)
+                self.sampled_views.append((found.poses, tracker.views(cuts.latest(found.poses), found.poses)))
+            yield found
+
+
+class _Latest(Iterator["Cut"]):
+    """An iterator that stores only its last item; `itertools.tee` would keep up to 57 items in memory."""
+
+    def __init__(self, cuts: Iterator[Cut]) -> None:
+        self._cuts = cuts
+
+    def __next__(self) -> Cut:
+        self.latest = next(self._cuts)
+        return self.latest
+
+
 # Minimum fraction of the visible contour that matches the colours for picks to be accepted. Six path-traced mouths
 # reached 0.26 to 0.5, and three dark, noisy or colourless ones 0.13 to 0.27 with errors up to 0.3 mm. A focal length
 # wrong by 15 % gave 0.05, and another subject's lower scan 0.08 and 0.12, with errors above 1 mm.
@@ -43,20 +214,11 @@ def track_videos(
         CaptureError: fewer than two cameras have a video, or one cannot be decoded.
         TrackingError: the teeth were not found.
     """
-    from jawusd.segmentation.picture import ColourFootage
     from jawusd.tracking.contour.scan import prepare_scan
     from jawusd.tracking.region.picture_start import ArchStart
     from jawusd.tracking.region.take import TakeFacts, footage_findings, tracks_of
 
-    cameras, videos = open_footage(capture)
-    if len(videos) < FEWEST_VIDEOS:
-        raise CaptureError(
-            f"{len(videos)} of {len(capture.cameras)} cameras have a video; tracking without masks needs at least "
-            f"{FEWEST_VIDEOS}.",
-            path=capture.folder / "capture.toml",
-        )
-    cameras = {name: camera for name, camera in cameras.items() if name in videos}
-    footage = ColourFootage(videos, offsets)
+    cameras, footage = open_colour_footage(capture, offsets, "tracking without masks")
     frames = range(*(capture.frames or footage.range()))
     subject = subject_of_capture(capture, meshes)
     teeth = meshes["upper_teeth"], meshes["lower_teeth"]
@@ -64,10 +226,12 @@ def track_videos(
     with ThreadPoolExecutor(jobs) as pool:
         rows = ArchStart(teeth, scans, capture.anatomy.T_anatomical_skull, pool.map)
         follower = Follower(footage, cameras, scans, subject, pool)
-        picks = capture.bootstrap
-        search = ArchSearch(capture, offsets, footage, rows, follower)
-        begin = search.run(frames, None, progress) if picks is None else _picked_start(rows, follower, picks, frames)
-        followed = follower.run(frames, partial(search.run, progress=progress), progress)
+        search = PictureSearch(capture, footage, cameras, offsets, rows, follower.start_at)
+        if capture.bootstrap is None:
+            begin = follower.start_by(search, frames, progress)
+        else:
+            begin = search.picked(capture.bootstrap, frames, _LEAST_PICKED_FIT)
+        followed = follower.run(frames, search, progress)
     facts = TakeFacts(
         tuple(cameras.values()),
         scans,
@@ -81,58 +245,3 @@ def track_videos(
     findings = [finding.as_json() for finding in (*rows.findings, *footage_findings(tracks))]
     tracks.meta["findings"] = [*tracks.meta.get("findings", []), *findings]
     return tracks
-
-
-def _picked_start(rows: ArchStart, follower: Follower, picks: Bootstrap, frames: range) -> Start[Array]:
-    """Return a start of tracking from the picks.
-
-    Raises:
-        TrackingError: the picks are inconsistent, or do not fit the images.
-    """
-
-    def begin() -> tuple[Array, float]:
-        found, fit = follower.start_at(picks.frame, rows.picked(picks, follower.cameras))
-        return found.poses, fit
-
-    return picked_start(picks.frame, frames, begin, _LEAST_PICKED_FIT)
-
-
-@dataclass(frozen=True, eq=False)
-class ArchSearch:
-    """A search for the teeth that starts a follower where they are found.
-
-    Attributes:
-        capture, footage: the capture, and the images of its cameras.
-        offsets: frame offset by camera.
-        rows: search for the arches in rough masks.
-        follower: tracker that refines the poses found, and measures their fit.
-    """
-
-    capture: Capture
-    offsets: Mapping[str, int]
-    footage: ColourFootage
-    rows: ArchStart
-    follower: Follower
-
-    def run(self, frames: range, up_world: Array | None, progress: Progress) -> Start[Array]:
-        """Search in a range of frames and start the follower; the pose is T_world_upper, T_world_lower (2, 4, 4).
-
-        `up_world` is the up direction of the head in the world, shape (3,), if it is known.
-
-        Raises:
-            TrackingError: the teeth were not found.
-            CaptureError: an image cannot be decoded.
-        """
-        cameras = self.follower.cameras
-
-        def near(sources: Sequence[CameraSource], frame: int) -> Array | None:
-            return self.rows.at(sources, cameras, self.offsets, frame)
-
-        def judged(frame: int, poses: Array) -> tuple[Array, float]:
-            found, fit = self.follower.start_at(frame, poses)
-            return found.poses, fit
-
-        begin = PictureSearch(self.capture, self.footage, cameras, near, judged).run(frames, progress, up_world)
-        # Start again: the search may have tried other starts after this one.
-        self.follower.start_at(begin.frame, begin.pose)
-        return begin

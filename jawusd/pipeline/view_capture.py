@@ -21,11 +21,11 @@ from jawusd.formats.tracks import Tracks, load_tracks
 from jawusd.geometry import Camera
 from jawusd.pipeline.calibrate import sync_cameras
 from jawusd.pipeline.cameras import check_same_cameras, load_cameras, open_backdrops, tracked_cameras
-from jawusd.pipeline.capture_inputs import open_capture
 from jawusd.pipeline.report import as_built, is_build, recorded_offsets
 from jawusd.pipeline.scans import save_reviewed
 from jawusd.pipeline.state import BuildState, Progress
 from jawusd.pipeline.subject import load_meshes, registered_meshes, subject_of_capture
+from jawusd.pipeline.workspace import open_capture
 
 if TYPE_CHECKING:
     from jawusd.media.overlay import Backdrop, PlacedScan

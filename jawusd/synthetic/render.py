@@ -17,7 +17,7 @@ from jawusd.base.errors import MissingDependencyError
 from jawusd.geometry import Camera, se3_inverse
 from jawusd.meshes.surfaces import vertex_normals
 from jawusd.synthetic import shaders
-from jawusd.synthetic.soft_tissue import Surface
+from jawusd.synthetic.anatomy import Surface
 
 NEAR_MM, FAR_MM = 80.0, 700.0
 #: Labels of surfaces; surfaces of every label can occlude the teeth.

@@ -15,13 +15,12 @@ from jawusd.base.arrays import Array, Mask
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry import Camera, make_transform, se3_inverse, so3_exp, transform_points
 from jawusd.meshes.surfaces import grid_faces
-from jawusd.synthetic.anatomy import Occlusion, PersonAnatomy, opened_bite
+from jawusd.synthetic.anatomy import Face, LipState, Occlusion, PersonAnatomy, Surface, opened_bite, palate, tongue
 from jawusd.synthetic.dental_arch import DentalArch
 from jawusd.synthetic.exercises import schedule, smooth_noise, smoothed
 from jawusd.synthetic.kinematics import smoothstep
 from jawusd.synthetic.person import Person
 from jawusd.synthetic.render import LOWER_TEETH, UPPER_TEETH, Picture, Renderer
-from jawusd.synthetic.soft_tissue import Face, LipState, Surface, palate, tongue
 
 #: Scan frame to world with the head at rest; the world is the first camera's frame: x right, y down, z forward.
 T_WORLD_SCAN = make_transform(np.diag([1.0, -1.0, -1.0]), [0.0, -14.0, 214.0])

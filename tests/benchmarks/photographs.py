@@ -29,10 +29,16 @@ from jawusd.geometry import transform_point
 from jawusd.media.overlay import save_png
 from jawusd.media.pictures import read_gray, read_picture
 from jawusd.meshes.meshio import load_mesh
-from jawusd.photographs import align_photographs
-from jawusd.photographs.align import _line_distances, _lower_incisor, _refined, _rms
+from jawusd.photographs.align import (
+    _line_distances,
+    _lower_incisor,
+    _refined,
+    _rms,
+    align_photographs,
+    drawn_over,
+    read_drawing,
+)
 from jawusd.photographs.solve import Bite, Contact
-from jawusd.pipeline.photographs import drawn_over, read_drawing
 
 COLOUR = 1  # cv2.IMREAD_COLOR
 VIEWS = ("front", "left", "right")

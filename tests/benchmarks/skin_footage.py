@@ -27,7 +27,7 @@ from jawusd.fitting.face import in_head
 from jawusd.formats.capture import load_capture
 from jawusd.geometry import transform_points
 from jawusd.pipeline.cameras import load_cameras, open_videos
-from jawusd.pipeline.skin_footage import SkinOfFootage
+from jawusd.pipeline.solve_skin import SkinOfFootage
 from jawusd.segmentation.picture import ColourFootage
 
 SIGMA_MM, CLOSED = 0.1, 0.95

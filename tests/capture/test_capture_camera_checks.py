@@ -5,8 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from jawusd.capture.camera_checks import camera_findings, common_target
-from jawusd.capture.mask_checks import centre_findings, width_findings
+from jawusd.capture.camera_checks import camera_findings, centre_findings, common_target, width_findings
 from jawusd.geometry import Camera, make_transform, se3_exp
 
 SIZE = (1280, 720)

@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from jawusd.base.errors import CaptureError, OutputError, TrackingError
 from jawusd.cli.main import app
-from jawusd.pipeline.photographs import read_drawing
+from jawusd.photographs.align import read_drawing
 
 
 def run(*arguments):

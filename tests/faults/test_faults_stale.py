@@ -8,9 +8,9 @@ from package_copy import ROOT
 from stage_results import stage_result
 
 from jawusd.base.errors import CaptureError
-from jawusd.pipeline import build, capture_inputs
+from jawusd.pipeline import build, workspace
 from jawusd.pipeline.build import BuildOptions
-from jawusd.pipeline.capture_inputs import InputWatch, input_files, open_capture
+from jawusd.pipeline.workspace import InputWatch, input_files, open_capture
 
 EXAMPLE = ROOT / "examples" / "capture"
 FROM_TRACK = ["track", "fit", "refine", "bake", "report"]
@@ -198,7 +198,7 @@ def test_what_only_looks_like_a_change_stops_nothing(rebuilt, capture, change):
 
 def test_untouched_inputs_are_read_once(capture, monkeypatch):
     read = []
-    monkeypatch.setattr(capture_inputs, "hash_files", lambda files: read.extend(files) or str(files))
+    monkeypatch.setattr(workspace, "hash_files", lambda files: read.extend(files) or str(files))
     watch, opened = InputWatch(), open_capture(capture)
     for _ in range(3):
         assert watch.hashes(opened, ["masks", "teeth"]) and watch.changed() == []

@@ -7,7 +7,8 @@ from closed_mouth import FOCAL, SIZE, VIEWS, Mouth, search_little
 
 from jawusd.base.errors import TrackingError
 from jawusd.geometry import make_transform, se3_exp, se3_inverse, transform_point
-from jawusd.photographs import align, read_lines
+from jawusd.photographs import align
+from jawusd.photographs.drawing import read_lines
 from jawusd.photographs.search import ArchPair, typical_bites
 from jawusd.photographs.solve import UNKNOWNS, Aligner, Bite, Contact, Photo, PhotoPose
 from jawusd.tracking.contour.scan import prepare_scan

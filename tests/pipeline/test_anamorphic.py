@@ -8,7 +8,7 @@ from jawusd.cameras.calibration import save_calibration
 from jawusd.geometry import Camera
 from jawusd.media.writers import VideoWriter
 from jawusd.pipeline.cameras import load_cameras
-from jawusd.pipeline.capture_inputs import open_capture
+from jawusd.pipeline.workspace import open_capture
 
 STORED = Camera("a", (64, 48), np.array([[50.0, 0, 30.0], [0, 100.0, 22.0], [0, 0, 1]]), np.zeros(0), np.eye(4))
 

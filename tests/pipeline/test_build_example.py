@@ -21,7 +21,7 @@ from jawusd.formats.tracks import load_tracks
 from jawusd.geometry import transform_points
 from jawusd.pipeline.build import BuildOptions, build
 from jawusd.pipeline.cameras import load_cameras, rescaled_cameras
-from jawusd.pipeline.capture_inputs import open_capture
+from jawusd.pipeline.workspace import open_capture
 from jawusd.rig.validate import validate_stage
 
 EXAMPLE = ROOT / "examples" / "capture"

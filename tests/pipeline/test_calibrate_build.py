@@ -19,7 +19,7 @@ from jawusd.geometry import triangulate
 from jawusd.pipeline.build import BuildOptions, build
 from jawusd.pipeline.calibrate import calibrate_boards
 from jawusd.pipeline.cameras import load_cameras
-from jawusd.pipeline.capture_inputs import input_files, open_capture
+from jawusd.pipeline.workspace import input_files, open_capture
 
 EXAMPLE = ROOT / "examples" / "capture"
 

@@ -14,7 +14,7 @@ from package_copy import ROOT
 from run_jawusd import program
 
 from jawusd.base.errors import CaptureError
-from jawusd.capture.mask_checks import swapped_cameras
+from jawusd.capture.camera_checks import swapped_cameras
 from jawusd.formats.capture import load_capture
 from jawusd.formats.finding import Finding
 from jawusd.media.writers import VideoWriter

@@ -22,12 +22,13 @@ from jawusd.geometry import transform_point, transform_points
 from jawusd.media import live_source
 from jawusd.media.live_source import LivePicture, LiveSource
 from jawusd.pipeline.cameras import load_cameras, open_videos
-from jawusd.pipeline.capture_inputs import open_capture
-from jawusd.pipeline.follow import Cutter
-from jawusd.pipeline.live import _Follower, live, next_instant
-from jawusd.pipeline.live_frame import LiveFrame, OscSender
-from jawusd.pipeline.solve_videos import PreparedTeeth, SkinOptions
+from jawusd.pipeline.live import OscSender, _Follower, live, next_instant
+from jawusd.pipeline.live_jaw import LiveFrame
+from jawusd.pipeline.skin import SkinOptions
+from jawusd.pipeline.solve_videos import PreparedTeeth
 from jawusd.pipeline.subject import load_labelled, registered_meshes
+from jawusd.pipeline.track_videos import Cutter
+from jawusd.pipeline.workspace import open_capture
 from jawusd.segmentation.picture import ColourFootage
 from jawusd.tracking.region.live import LiveTake
 

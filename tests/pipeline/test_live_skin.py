@@ -14,9 +14,8 @@ import jawusd
 from jawusd.base.errors import FittingError, FormatError
 from jawusd.formats.performance import SolveState
 from jawusd.media import live_source
-from jawusd.pipeline.live_frame import LiveJaw
-from jawusd.pipeline.live_skin import LiveSkin, columns_between
-from jawusd.pipeline.solve_videos import SkinOptions
+from jawusd.pipeline.live_jaw import LiveJaw, LiveSkin, columns_between
+from jawusd.pipeline.skin import SkinOptions
 
 FPS, FACE_FPS = 24.0, 60.0
 HEADER = ",".join(["time_s", *(f"{name}_{axis}" for name in NAMES for axis in "xyz")])

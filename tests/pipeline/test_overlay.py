@@ -14,8 +14,8 @@ from jawusd.formats.performance import STATE_COLOURS, SolvedJaw, SolveState
 from jawusd.formats.tracks import Tracks
 from jawusd.geometry import Camera, make_transform, relative_pose
 from jawusd.media.writers import VideoWriter
-from jawusd.pipeline.capture_inputs import open_capture
 from jawusd.pipeline.pictures import TILE_PX, overlay_files, write_overlay
+from jawusd.pipeline.workspace import open_capture
 
 SIZE = (240, 180)
 K = np.array([[300.0, 0, 120], [0, 300, 90], [0, 0, 1]])

@@ -1,5 +1,7 @@
 """The search for teeth in footage ends, and reports the frames tried."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -53,11 +55,12 @@ def searched(monkeypatch):
         UPRIGHT["turns"] = upright
         footage, tried = _Footage(), []
 
-        def near(sources, frame):
+        def near(sources, cameras, offsets, frame):
             tried.append(frame)
             return None if fit_of(frame) is None else "pose"
 
-        search = PictureSearch(None, footage, CAMERAS, near, lambda frame, pose: (pose, fit_of(frame)))
+        rows = SimpleNamespace(at=near)
+        search = PictureSearch(None, footage, CAMERAS, {}, rows, lambda frame, pose: (pose, fit_of(frame)))
         try:
             return search.run(TAKE, progress), tried, footage
         except TrackingError as error:

@@ -10,8 +10,8 @@ from run_jawusd import program
 from jawusd.cameras.calibration import save_calibration
 from jawusd.geometry import Camera, make_transform
 from jawusd.media.writers import VideoWriter
-from jawusd.pipeline.capture_inputs import open_capture
 from jawusd.pipeline.pictures import write_plates
+from jawusd.pipeline.workspace import open_capture
 from jawusd.rig.cameras import PLATE
 
 SIZE = (320, 240)

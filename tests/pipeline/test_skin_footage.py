@@ -8,7 +8,7 @@ from skin_dots import DottedFace
 
 from jawusd.base.errors import FittingError
 from jawusd.geometry import transform_points
-from jawusd.pipeline.skin_footage import SkinOfFootage
+from jawusd.pipeline.solve_skin import SkinOfFootage
 
 
 def errors_mm(rig, d, T_true):

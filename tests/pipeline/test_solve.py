@@ -18,8 +18,8 @@ from jawusd.formats.tracks import load_tracks
 from jawusd.geometry import transform_point, transform_points
 from jawusd.media.video import Video
 from jawusd.pipeline.cameras import load_cameras
-from jawusd.pipeline.capture_inputs import open_capture
 from jawusd.pipeline.solve import check_output, solve, solve_summary, write_solved
+from jawusd.pipeline.workspace import open_capture
 from jawusd.rig.motion_read import read_poses_of_stage
 
 EXAMPLE = ROOT / "examples" / "capture"

@@ -9,8 +9,8 @@ from example_people import person
 
 import jawusd
 from jawusd.base.errors import FittingError, FormatError
+from jawusd.pipeline.skin import SkinOptions
 from jawusd.pipeline.solve_skin import SkinOfShot
-from jawusd.pipeline.solve_videos import SkinOptions
 
 FPS, FACE_FPS, LATE_S = 25.0, 30.0, 0.42  # the face starts 0.42 s after frame 0 of the shot
 

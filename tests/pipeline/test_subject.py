@@ -14,7 +14,6 @@ from jawusd.formats.model import JawModel, save_model
 from jawusd.geometry import LANDMARKS, landmark_frame
 from jawusd.geometry.anatomy import MEAN_CONDYLES
 from jawusd.pipeline.bake import bake_subject
-from jawusd.pipeline.capture_inputs import open_capture
 from jawusd.pipeline.subject import (
     load_meshes,
     registered_subject,
@@ -23,6 +22,7 @@ from jawusd.pipeline.subject import (
     subject_of_landmarks,
     subject_of_scans,
 )
+from jawusd.pipeline.workspace import open_capture
 from jawusd.rig.bake import bake_rig
 
 SCANS = {name: ROOT / "examples" / "capture" / "scans" / f"{name}.ply" for name in ("upper_teeth", "lower_teeth")}

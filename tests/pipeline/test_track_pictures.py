@@ -11,7 +11,7 @@ from jawusd.cli.text_build import track_lines
 from jawusd.formats.capture import load_capture
 from jawusd.formats.tracks import LOST
 from jawusd.geometry import se3_exp, transform_points
-from jawusd.pipeline import track_videos as videos
+from jawusd.pipeline import cameras as opening
 from jawusd.pipeline.cameras import open_footage
 from jawusd.pipeline.state import no_progress
 from jawusd.pipeline.subject import load_meshes
@@ -89,7 +89,7 @@ def test_wrong_cameras_and_scans_are_named(offsets, monkeypatch, spoil, size, ki
         cameras, videos = open_footage(capture)
         return {name: spoil(one) if spoil and name == camera else one for name, one in cameras.items()}, videos
 
-    monkeypatch.setattr(videos, "open_footage", opened)
+    monkeypatch.setattr(opening, "open_footage", opened)
     start = load_capture(EXAMPLE).bootstrap.frame
     capture = unmasked((start - 3, start + 9))
     meshes = {

@@ -8,9 +8,9 @@ from skin_shot import closed_share, slides
 
 from jawusd.geometry import transform_points
 from jawusd.meshes.surfaces import vertex_normals
+from jawusd.synthetic.anatomy import Face, LipState
 from jawusd.synthetic.exercises import record, smooth_noise, smoothed
 from jawusd.synthetic.person import Person
-from jawusd.synthetic.soft_tissue import Face, LipState
 from jawusd.synthetic.take import _head, build_cameras
 
 _RANGE = np.array([0.35, 0.6, 0.6])  # of the jaw behind closed lips

@@ -14,12 +14,11 @@ from jawusd.cameras.calibration import save_calibration
 from jawusd.formats.atomic import write_bytes_atomic, write_npz_atomic, write_text_atomic
 from jawusd.geometry import LANDMARKS
 from jawusd.media.writers import VideoWriter
-from jawusd.synthetic.anatomy import build_anatomy, opened_bite
+from jawusd.synthetic.anatomy import Face, build_anatomy, opened_bite
 from jawusd.synthetic.exercises import smooth_noise, smoothed
 from jawusd.synthetic.kinematics import smoothstep
 from jawusd.synthetic.person import Person
 from jawusd.synthetic.render import Renderer
-from jawusd.synthetic.soft_tissue import Face
 from jawusd.synthetic.take import FPS, Scene, build_cameras, perform
 
 _NOISE = 1.3  # of the sensor [grey levels of 255]

@@ -12,9 +12,8 @@ from jawusd.formats.mesh import Mesh
 from jawusd.geometry import Camera, make_transform, so3_exp, transform_points
 from jawusd.meshes import raster
 from jawusd.synthetic import render
-from jawusd.synthetic.anatomy import build_anatomy
+from jawusd.synthetic.anatomy import Surface, build_anatomy
 from jawusd.synthetic.person import Person
-from jawusd.synthetic.soft_tissue import Surface
 from jawusd.synthetic.take import (
     BOARD_COLUMNS,
     BOARD_ROWS,

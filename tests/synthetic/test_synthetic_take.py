@@ -5,10 +5,9 @@ import pytest
 
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry import se3_inverse, se3_log, transform_point, transform_points
-from jawusd.synthetic.anatomy import PersonAnatomy, build_anatomy
+from jawusd.synthetic.anatomy import Face, LipState, PersonAnatomy, build_anatomy, palate, tongue
 from jawusd.synthetic.annotations import Outline, choose_picks, drawn_mask
 from jawusd.synthetic.person import Person
-from jawusd.synthetic.soft_tissue import Face, LipState, palate, tongue
 from jawusd.synthetic.take import LEAD, T_WORLD_SCAN, TAIL, Take, build_cameras, perform
 
 PERSON = Person(0)

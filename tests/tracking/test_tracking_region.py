@@ -12,9 +12,9 @@ from package_copy import ROOT
 from jawusd.formats.capture import load_capture
 from jawusd.geometry import relative_pose
 from jawusd.pipeline.cameras import open_footage
-from jawusd.pipeline.follow import Follower
 from jawusd.pipeline.segment_guide import known_guide, save_guide
 from jawusd.pipeline.subject import load_meshes, subject_of_capture
+from jawusd.pipeline.track_videos import Follower
 from jawusd.segmentation.picture import ColourFootage
 from jawusd.tracking.contour.samples import COLUMNS, INVERSE_DEPTH, LENGTH, NX, NY, U, V, X, Y
 from jawusd.tracking.contour.scan import CROWN, prepare_scan
@@ -182,7 +182,7 @@ def test_the_example_is_followed_by_its_colours(tmp_path):
     footage, subject = Counted(videos, offsets), subject_of_capture(capture, meshes)
     follower = Follower(footage, cameras, prepared(teeth), subject)
     assert follower.start_at(start, picked)[1] > 0.3
-    guide = follower.run(chosen, not_searched, lambda *step: done.append(step))
+    guide = follower.run(chosen, NotSearched, lambda *step: done.append(step))
     assert 1 <= footage.most <= 2  # otherwise long takes exhaust the memory
     assert sorted(guide) == list(chosen) and done[-1] == ("follow", len(chosen), len(chosen))
     for frame, found in guide.items():
@@ -289,7 +289,7 @@ def test_teeth_are_found_again_when_lips_open_over_an_open_jaw():
     picked = GuidedTracker(*teeth, lambda *_: [], 1).picked(capture.bootstrap, cameras)
     follower = Follower(Covered(videos, offsets), cameras, prepared(teeth), subject_of_capture(capture, meshes))
     follower.start_at(start, picked)
-    guide = follower.run(range(20, 25), not_searched, lambda *_: None)
+    guide = follower.run(range(20, 25), NotSearched, lambda *_: None)
     assert not guide[22].found.any()
     exact = {frame: relative[Covered.SHOWN[frame] - first] for frame in (23, 24)}
     assert np.linalg.norm((exact[23] @ incisor - incisor)[:3]) > 10.0  # mm; the head moved by 4 mm
@@ -298,8 +298,12 @@ def test_teeth_are_found_again_when_lips_open_over_an_open_jaw():
         assert np.linalg.norm(((relative_pose(*guide[frame].poses) - true) @ incisor)[:3]) < 0.5
 
 
-def not_searched(frames, up_world):
-    raise AssertionError(f"the teeth are not lost on frames {frames}")
+class NotSearched:
+    """A search that fails the test."""
+
+    @staticmethod
+    def run(frames, *_):
+        raise AssertionError(f"the teeth are not lost on frames {frames}")
 
 
 def test_light_of_codes_is_their_power():

@@ -16,10 +16,17 @@ from jawusd.geometry import Camera, so3_log, transform_point, transform_points
 from jawusd.media.overlay import save_png
 from jawusd.media.pictures import read_gray, read_picture
 from jawusd.meshes.meshio import load_mesh
-from jawusd.photographs import PhotoAlignment, align_photographs
-from jawusd.photographs.align import _AT_WIDTH_PX, _TURN_PX, _lower_incisor, _refined
+from jawusd.photographs.align import (
+    _AT_WIDTH_PX,
+    _TURN_PX,
+    PhotoAlignment,
+    _lower_incisor,
+    _refined,
+    align_photographs,
+    drawn_over,
+    read_drawing,
+)
 from jawusd.photographs.solve import Bite, Contact, match, seen_outlines
-from jawusd.pipeline.photographs import drawn_over, read_drawing
 from jawusd.segmentation.arches import ScanSurface, expect_crowns
 from jawusd.segmentation.colours import ColourModel, SegmentationConfig
 from jawusd.segmentation.learn import cut_picture

@@ -21,9 +21,9 @@ from jawusd.formats.atomic import write_bytes_atomic, write_npz_atomic, write_te
 from jawusd.formats.mesh import Mesh, crown_face_mask
 from jawusd.geometry import Camera, make_transform, se3_inverse, so3_exp, transform_points
 from jawusd.meshes.raster import draw_depth_labels
+from jawusd.synthetic.anatomy import Face, palate, tongue
 from jawusd.synthetic.dental_arch import DentalArch
 from jawusd.synthetic.person import draw_joint
-from jawusd.synthetic.soft_tissue import Face, palate, tongue
 from subjects.annotator import FINER, Annotator, MaskDrawer, draw_annotator, write_mask
 from subjects.bite import Bite, build_bite
 from subjects.dentition import without_gum

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from jawusd.base.arrays import Array
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry import Camera, make_transform, se3_inverse, so3_exp, transform_points
+from jawusd.synthetic.anatomy import LipState
 from jawusd.synthetic.annotations import spread_out
 from jawusd.synthetic.kinematics import Joint, controlled_pose, smoothstep
-from jawusd.synthetic.soft_tissue import LipState
 from subjects.bite import Bite
 
 #: Labels (rows, columns), first column and row of that part of the picture, inverse depth (rows, columns) [1/mm].

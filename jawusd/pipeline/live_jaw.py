@@ -1,4 +1,4 @@
-"""The jaw of live frames by facial skin: match the rows of a face tracker with the images by time."""
+"""The jaw of live frames, corrected by facial skin: the rows of a face tracker are matched with the images by time."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -19,12 +20,69 @@ from jawusd.evaluator.skin import Skin, SkinJaw
 from jawusd.formats.face_table import FaceTable, read_face_row
 from jawusd.formats.performance import SolveState
 from jawusd.media import live_source
-from jawusd.pipeline.live_frame import LiveJaw
 from jawusd.pipeline.markers import LENGTH_UNITS_MM
-from jawusd.pipeline.skin import load_own_skin, own_columns, read_face
+from jawusd.pipeline.skin import SkinOptions, load_own_skin, own_columns, read_shot_face
 from jawusd.pipeline.solve_skin import check_agreement
-from jawusd.pipeline.solve_videos import SkinOptions
 from jawusd.tracking.performance.skin import SkinFilter
+
+
+@dataclass(frozen=True, eq=False)
+class LiveJaw:
+    """The jaw in one frame.
+
+    Attributes:
+        d: jaw parameters [mm], shape (3,).
+        covariance: their covariance [mm^2], shape (3, 3).
+        state: solved, skin or carried.
+        familiar: as in `LiveFrame`.
+    """
+
+    d: Array
+    covariance: Array
+    state: SolveState
+    familiar: bool | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class LiveFrame:
+    """Result of one frame, which consists of the images of all sources at one time.
+
+    Attributes:
+        time_s: capture time of the images [s] since the start of the sources; for files, since their first images.
+        d, sigma: jaw parameters and their standard deviations [mm], shape (3,).
+        margin_mm: signed distance to the rig's bound [mm], positive inside.
+        verdict: the rig's verdict on the pose.
+        state: name of the `SolveState`: solved, skin or carried.
+        latency_ms: time from the capture of the images to this result [ms].
+        dropped: number of frames dropped since the last result.
+        familiar: whether the face resembles those from which the map was learned; None without skin, or if the face
+            tracker has no row near this time.
+    """
+
+    time_s: float
+    d: Array
+    sigma: Array
+    margin_mm: float
+    verdict: str
+    state: str
+    latency_ms: float
+    dropped: int
+    familiar: bool | None = None
+
+    def as_json(self) -> dict[str, object]:
+        """Return the result as JSON-serialisable values, rounded to significant digits."""
+        return {
+            "time_s": round(self.time_s, 4),
+            "d": [round(value, 3) for value in self.d.tolist()],
+            "sigma": [round(value, 3) for value in self.sigma.tolist()],
+            "margin_mm": round(self.margin_mm, 3),
+            "verdict": self.verdict,
+            "state": self.state,
+            "latency_ms": round(self.latency_ms, 1),
+            "dropped": self.dropped,
+            "familiar": self.familiar,
+        }
+
 
 #: Name of the standard input.
 STANDARD_INPUT = "-"
@@ -100,13 +158,8 @@ class RecordedFace:
         Raises:
             FormatError: it is invalid, or has other columns than those of the map or no frame rate.
         """
-        face = read_face(options.face, options.fps, options.unit, options.rigid, options.rest_frame)
-        columns = own_columns(skin, options.skin, face, options.face)
-        if not face.fps:
-            raise FormatError("does not state its frame rate.", path=options.face, hint="Give it with --face-fps.")
-        self._times_s = face.frames / face.fps + (options.offset_s or 0.0)
-        self._rows = columns.reshape(len(columns), -1)
-        self._begin_s = 0.0
+        times_s, self._rows = read_shot_face(skin, options)
+        self._times_s, self._begin_s = times_s + (options.offset_s or 0.0), 0.0
 
     def play(self, begin_s: float, silence_s: float) -> None:
         """Start at a time on the live clock [s]."""
