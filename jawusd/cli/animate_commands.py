@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from jawusd.cli.options import USD_SUFFIXES, Allow, Force, Json, Prim, RigArg, rig_of_folder
-from jawusd.cli.output import emit
+from jawusd.cli.output import emit, refuse_any
 from jawusd.formats.atomic import refuse_existing
 
 if TYPE_CHECKING:
@@ -141,13 +141,11 @@ def animate(
 ) -> None:
     """Write an animation layer over a rig, or meshes and motion as .glb; frames clamped to the bound are reported."""
     import jawusd
-    from jawusd.cli.animate_commands import read_face
     from jawusd.cli.motion import carried_over, emit_motion, resampled
     from jawusd.rig import describe
 
     _refuse_conflicts(source, arkit, retarget_from, mapping, resample, prim, splines, out)
-    for path in filter(None, (out, splines)):
-        refuse_existing(path, force)
+    refuse_any(force, out, splines)
     loaded = jawusd.load(rig, prim=prim)
     if source is not None and retarget_from is not None:
         motion, changes = carried_over(retarget_from, source, loaded)
@@ -208,7 +206,6 @@ def rate_of(rig: Path, prim: str | None) -> float:
     Raises:
         typer.BadParameter: the rig does not state a frame rate.
     """
-    from jawusd.cli.options import USD_SUFFIXES
     from jawusd.rig import describe
 
     if rig.suffix.lower() not in USD_SUFFIXES:

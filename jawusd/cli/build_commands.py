@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import shlex
-from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -18,9 +17,9 @@ from jawusd.cli.options import (
     Force,
     GroupOption,
     InvertOption,
+    Jobs,
     Json,
     LandmarksOption,
-    LengthUnit,
     LowerOption,
     MandibleOption,
     Method,
@@ -33,38 +32,28 @@ from jawusd.cli.options import (
     subject_given,
     trajectory_options,
 )
-from jawusd.cli.output import emit, progress, say
+from jawusd.cli.output import emit, progress, refuse_any, say
 from jawusd.formats.atomic import refuse_existing
 
-
-class Solver(StrEnum):
-    """Trackers."""
-
-    contour = "contour"
-    paper = "paper"
+#: Trackers.
+Solver = Literal["contour", "paper"]
 
 
-class Backend(StrEnum):
-    """Renderers of the paper's solver."""
-
-    cpu = "cpu"
-    gl = "gl"
+#: Renderers of the paper's solver.
+Backend = Literal["cpu", "gl"]
 
 
 SolverOption = Annotated[Solver, typer.Option(help="Tracker; paper, for comparison, is slower and less accurate.")]
 BackendOption = Annotated[Backend, typer.Option(help="Renderer of --solver paper; gl needs OpenGL 4.3 (EGL).")]
 
 
-Jobs = Annotated[int, typer.Option(min=1, max=64, help="Number of threads.")]
-
-
 def build(
     context: typer.Context,
     capture: CaptureArg,
     out: Annotated[Path, typer.Option("-o", "--out", help="Folder of the rig.", show_default=False)],
-    model: Annotated[Method, typer.Option(help="Form of the jaw model.")] = Method.anchored,
-    solver: SolverOption = Solver.contour,
-    backend: BackendOption = Backend.cpu,
+    model: Annotated[Method, typer.Option(help="Form of the jaw model.")] = "anchored",
+    solver: SolverOption = "contour",
+    backend: BackendOption = "cpu",
     resume: Annotated[bool, typer.Option("--resume", help="Continue an earlier build in this folder.")] = False,
     fresh: Annotated[bool, typer.Option("--fresh", help="Delete an earlier build in this folder first.")] = False,
     dry_run: Annotated[
@@ -84,9 +73,9 @@ def build(
     map_large_arrays()
     _check_backend(solver, backend)
     options = stages.BuildOptions(
-        model.value,
-        solver.value,
-        backend.value,
+        model,
+        solver,
+        backend,
         jobs=jobs,
         resume=resume,
         fresh=fresh,
@@ -111,8 +100,8 @@ def build(
 def track(
     capture: CaptureArg,
     out: Annotated[Path, typer.Option("-o", "--out", help="File of the tracks.")] = Path("tracks.npz"),
-    solver: SolverOption = Solver.contour,
-    backend: BackendOption = Backend.cpu,
+    solver: SolverOption = "contour",
+    backend: BackendOption = "cpu",
     prior: Annotated[
         Path | None,
         typer.Option(help="model.npz of this subject, as a prior for a second pass.", show_default=False),
@@ -137,18 +126,17 @@ def track(
     from jawusd.pipeline.workspace import open_capture
 
     _check_backend(solver, backend)
-    refuse_existing(out, force)
+    refuse_any(force, out)
     model = load_model(prior) if prior else None
     opened = open_capture(capture, allow_outside=allow_outside)
     drawn = overlay_files(opened, overlay) if overlay else []
-    for path in drawn:
-        refuse_existing(path, force)
+    refuse_any(force, *drawn)
     with progress() as report:
         tracks = stage.track(
             opened,
             out,
-            solver=solver.value,
-            backend=backend.value,
+            solver=solver,
+            backend=backend,
             model=model,
             overlay=overlay,
             jobs=jobs,
@@ -160,7 +148,7 @@ def track(
 
 
 def _check_backend(solver: Solver, backend: Backend) -> None:
-    if backend is Backend.gl and solver is not Solver.paper:
+    if backend == "gl" and solver != "paper":
         raise typer.BadParameter("--backend gl needs --solver paper; the contour solver runs on the CPU.")
 
 
@@ -178,13 +166,13 @@ def fit(
     mandible: MandibleOption = None,
     landmarks: LandmarksOption = None,
     columns: ColumnsOption = None,
-    length_unit: UnitOption = LengthUnit.mm,
+    length_unit: UnitOption = "mm",
     invert: InvertOption = False,
     rest_frame: RestOption = None,
     group: GroupOption = None,
     rigid: RigidOption = None,
     out: Annotated[Path, typer.Option("-o", "--out", help="File of the model.")] = Path("model.npz"),
-    model: Annotated[Method, typer.Option(help="Form of the jaw model.")] = Method.anchored,
+    model: Annotated[Method, typer.Option(help="Form of the jaw model.")] = "anchored",
     force: Force = False,
     allow_outside: Outside = False,
     as_json: Json = False,
@@ -198,7 +186,7 @@ def fit(
     motion, fps = read_motion(poses, trajectory_options(columns, length_unit, invert, rest_frame, group, rigid))
     subject = subject_given(poses.stem, capture, upper_teeth, lower_teeth, mandible, landmarks, allow_outside)
     with progress() as report, naming_file(poses):
-        fitted = fit_subject(subject, motion, model.value, report, fps)
+        fitted = fit_subject(subject, motion, model, report, fps)
     save_model(out, fitted)
     summary = fit_summary(fitted)
     emit({**summary, "file": str(out)}, as_json, lambda: fit_lines(summary))
@@ -270,7 +258,7 @@ def build_many(
         ),
     ],
     out: Annotated[Path, typer.Option("-o", "--out", help="Parent folder of the rigs' folders.", show_default=False)],
-    model: Annotated[Method, typer.Option(help="Form of the jaw models.")] = Method.anchored,
+    model: Annotated[Method, typer.Option(help="Form of the jaw models.")] = "anchored",
     cluster: Annotated[
         str | None,
         typer.Option(
@@ -302,7 +290,7 @@ def build_many(
     if cluster is not None and workers is not None:
         raise typer.BadParameter("--workers are local processes and cannot be combined with --cluster.")
     build = BuildOptions(
-        model.value,
+        model,
         jobs=jobs,
         resume=resume,
         fresh=fresh,

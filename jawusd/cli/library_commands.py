@@ -1,15 +1,14 @@
-"""Commands on several actors: `library`, and `retarget` to another rig or to a subject without a rig."""
+"""Commands on several actors: `library`, `publish`, and `retarget` to another rig or to a subject without a rig."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from jawusd.cli.options import Allow, Force, Json, Prim, rig_of_folder
+from jawusd.cli.options import Allow, Force, Json, Prim, PrimName, rig_of_folder
 from jawusd.cli.output import emit, progress
 from jawusd.formats.atomic import refuse_existing
 
@@ -17,11 +16,8 @@ if TYPE_CHECKING:
     from jawusd.library.index import Entry, Library
 
 
-class Use(StrEnum):
-    """Ways to combine the subjects of a library."""
-
-    average = "average"
-    closest = "closest"
+#: Ways to combine the subjects of a library.
+Use = Literal["average", "closest"]
 
 
 def retarget(
@@ -41,7 +37,7 @@ def retarget(
     ] = None,
     use: Annotated[
         Use, typer.Option(help="With --landmarks: average the library, or use the closest subject.")
-    ] = Use.average,
+    ] = "average",
     fps: Annotated[float | None, typer.Option(min=0.001, help="Frames per second. Default: as in the motion.")] = None,
     out: Annotated[
         Path | None,
@@ -96,7 +92,7 @@ def _personal(landmarks: Path, folder: Path, use: Use, out: Path, force: bool, a
     refuse_existing(out, force)
     opened = open_library(folder)
     with progress() as report:
-        made = personal_rig(landmarks, opened, closest=use is Use.closest, name=landmarks.stem, progress=report)
+        made = personal_rig(landmarks, opened, closest=use == "closest", name=landmarks.stem, progress=report)
     save_model(out, made.model)
     known, weights = fit_summary(made.model), made.motion.weights
     ranges, warnings, not_used = known["ranges_mm"], known["warnings"], [*made.left_out, *opened.skipped]
@@ -109,7 +105,7 @@ def _personal(landmarks: Path, folder: Path, use: Use, out: Path, force: bool, a
         return found + [f"  {warning['code']}: {warning['message']}" for warning in warnings]
 
     rest = {"ranges_mm": ranges, "not_used": not_used, "warnings": warnings}
-    emit({"file": str(out), "use": use.value, **made.header, **rest}, as_json, lines)
+    emit({"file": str(out), "use": use, **made.header, **rest}, as_json, lines)
 
 
 def library(
@@ -208,3 +204,34 @@ def _compare(first: Entry, second: Entry, as_json: bool) -> None:
         "measures_mm": {key: {"first": a[key], "second": b[key], "difference": b[key] - a[key]} for key in a},
     }
     emit(compared, as_json, lines)
+
+
+def publish(
+    source: Annotated[
+        Path,
+        typer.Argument(help="Folder of a rig (with actor.usda), or a shot.", metavar="FOLDER|SHOT", show_default=False),
+    ],
+    out: Annotated[
+        Path, typer.Option("-o", "--out", help="Folder to write, or the .usdz of a shot.", show_default=False)
+    ],
+    prefix: Annotated[
+        str | None, typer.Option(help="Prefix of all file names. Default: the actor's name.", show_default=False)
+    ] = None,
+    prim_name: PrimName = None,
+    force: Force = False,
+    allow: Allow = None,
+    as_json: Json = False,
+) -> None:
+    """Copy a rig under unique file names, so that several actors can be packed together; or pack a shot as .usdz."""
+    from jawusd.rig.publish import publish_rig, write_package
+
+    refuse_existing(out, force)
+    if not source.is_dir():
+        if out.suffix.lower() != ".usdz" or prefix is not None or prim_name is not None:
+            raise typer.BadParameter(
+                "a shot is packed as .usdz; give such a file, and neither --prefix nor --prim-name.", param_hint="--out"
+            )
+        files = [str(write_package(out, source))]
+    else:
+        files = [str(path) for path in publish_rig(source, out, prefix, prim_name)]
+    emit({"files": files}, as_json, lambda: files)

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -15,21 +14,12 @@ if TYPE_CHECKING:
     from jawusd.pipeline.subject import Subject
 
 
-class Method(StrEnum):
-    """Forms of the jaw model."""
-
-    anchored = "anchored"
-    additive = "additive"
-    paper = "paper"
-    pca = "pca"
+#: Forms of the jaw model.
+Method = Literal["anchored", "additive", "paper", "pca"]
 
 
-class LengthUnit(StrEnum):
-    """Length units of tables."""
-
-    mm = "mm"
-    cm = "cm"
-    m = "m"
+#: Length units of tables.
+LengthUnit = Literal["mm", "cm", "m"]
 
 
 USD_SUFFIXES = (".usd", ".usda", ".usdc", ".usdz")
@@ -37,6 +27,7 @@ USD_SUFFIXES = (".usd", ".usda", ".usdc", ".usdz")
 Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 Force = Annotated[bool, typer.Option("--force", help="Overwrite an existing output.")]
 Outside = Annotated[bool, typer.Option("--allow-outside", help="Allow paths that point outside the capture's folder.")]
+Jobs = Annotated[int, typer.Option(min=1, max=64, help="Number of threads.")]
 CaptureArg = Annotated[Path, typer.Argument(help="capture.toml or its folder.", show_default=False)]
 
 
@@ -192,7 +183,7 @@ def trajectory_options(
     """
     from jawusd.pipeline.fit import TrajectoryOptions
 
-    return TrajectoryOptions(_column_map(columns), length_unit.value, invert, rest_frame, group, rigid_bodies(rigid))
+    return TrajectoryOptions(_column_map(columns), length_unit, invert, rest_frame, group, rigid_bodies(rigid))
 
 
 def rigid_bodies(given: list[str] | None) -> dict[str, str]:

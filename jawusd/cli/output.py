@@ -58,6 +58,15 @@ def plain(value: object) -> object:
     return str(value) if isinstance(value, Path) else value
 
 
+def refuse_any(force: bool, *paths: Path | None) -> None:
+    """Check that none of the output files exists, unless forced; see `refuse_existing`."""
+    from jawusd.formats.atomic import refuse_existing
+
+    for path in paths:
+        if path is not None:
+            refuse_existing(path, force)
+
+
 @contextlib.contextmanager
 def progress() -> Iterator[Callable[[str, int, int], None]]:
     """Show the progress of long work on stderr; yield the callback for it, which takes (stage, done, total)."""

@@ -17,7 +17,6 @@ from jawusd.cli.options import (
     InvertOption,
     Json,
     LandmarksOption,
-    LengthUnit,
     LowerOption,
     MandibleOption,
     Outside,
@@ -29,7 +28,7 @@ from jawusd.cli.options import (
     subject_given,
     trajectory_options,
 )
-from jawusd.cli.output import emit, progress, say
+from jawusd.cli.output import emit, progress, refuse_any, say
 from jawusd.formats.atomic import refuse_existing
 
 if TYPE_CHECKING:
@@ -63,7 +62,7 @@ def report(
     mandible: MandibleOption = None,
     landmarks: LandmarksOption = None,
     columns: ColumnsOption = None,
-    length_unit: UnitOption = LengthUnit.mm,
+    length_unit: UnitOption = "mm",
     invert: InvertOption = False,
     rest_frame: RestOption = None,
     group: GroupOption = None,
@@ -85,8 +84,7 @@ def report(
     from jawusd.pipeline.subject import subject_of_build
 
     folder = out or source / "experiments"
-    for path in stage.experiment_files(folder):
-        refuse_existing(path, force)
+    refuse_any(force, *stage.experiment_files(folder))
     poses = stage.fitted_poses(source) if source.is_dir() else source
     motion, _ = read_motion(poses, options)
     given = (capture, upper_teeth, lower_teeth, mandible, landmarks)
@@ -101,8 +99,6 @@ def report(
 
 
 def _emit_experiments(found: Experiments, files: list[Path], as_json: bool) -> None:
-    from jawusd.cli.report_commands import experiment_lines
-
     summary = {
         "actor": found.actor,
         "frames": found.frames,

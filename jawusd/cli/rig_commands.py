@@ -7,16 +7,17 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from jawusd.cli.face_validation import (
+from jawusd.cli.face_commands import (
+    NO,
     AlignOption,
     CsvOption,
     FaceOption,
     FaceOptions,
     MappingOption,
     StripOption,
+    counted,
     validate_face,
     verdict_lines,
-    verdict_rows,
 )
 from jawusd.cli.options import (
     USD_SUFFIXES,
@@ -41,9 +42,6 @@ if TYPE_CHECKING:
     from jawusd.rig.read import Description
 
 Triple = tuple[float, float, float]
-
-#: Exit code of a negative result, such as an invalid pose or a rig with errors.
-NO = 1
 
 
 def info(
@@ -233,22 +231,12 @@ def validate(
     unbaked = _unbaked(loaded, poses, prim)
     frames, T = _poses_or_parameters(loaded, poses, prim)
     verdicts = loaded.validate(T, residual_limit_mm=residual_mm, tolerance_mm=tolerance_mm)
-    rows = verdict_rows(frames, verdicts)
-    invalid = [row for row in rows if not row["valid"]]
-    inside = int((verdicts.valid & verdicts.inside()).sum())
-    result = {
-        "poses": len(rows),
-        "inside": inside,
-        "within_tolerance": len(rows) - len(invalid) - inside,
-        "invalid": len(invalid),
-        "tolerance_mm": verdicts.tolerance_mm,
-        **({"unbaked": unbaked["figures"]} if unbaked else {}),
-        "verdicts": rows,
-    }
-    counts = f"{inside} inside, {result['within_tolerance']} within tolerance, {len(invalid)} invalid"
-    summary = f"{len(rows)} poses: {counts} (tolerance of measured poses {verdicts.tolerance_mm:.2f} mm)"
+    rows, counts, words = counted(frames, verdicts)
+    stale = {"unbaked": unbaked["figures"]} if unbaked else {}
+    result = {"poses": len(rows), **counts, **stale, "verdicts": rows}
+    summary = f"{len(rows)} poses: {words} (tolerance of measured poses {verdicts.tolerance_mm:.2f} mm)"
     emit(result, as_json, lambda: [*verdict_lines(rows), *unbaked.get("lines", []), summary])
-    if invalid or unbaked:
+    if counts["invalid"] or unbaked:
         raise typer.Exit(NO)
 
 

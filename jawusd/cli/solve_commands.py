@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import json
-from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from jawusd.cli.options import Allow, Force, Json, LengthUnit, Outside, Prim, RigArg, UnitOption, rigid_bodies
-from jawusd.cli.output import emit, progress, say
-from jawusd.cli.skin_command import RestFrame, Rigid
-from jawusd.formats.atomic import refuse_existing
+from jawusd.cli.face_commands import Fps, RestFrame, Rigid
+from jawusd.cli.options import Allow, Force, Jobs, Json, LengthUnit, Outside, Prim, RigArg, UnitOption, rigid_bodies
+from jawusd.cli.output import emit, progress, refuse_any, say
 from jawusd.formats.finding import Finding
 
 if TYPE_CHECKING:
@@ -25,18 +23,12 @@ if TYPE_CHECKING:
     from jawusd.viewer.server import Viewer
 
 
-class Head(StrEnum):
-    """Motion of the head relative to the cameras."""
-
-    free = "free"
-    fixed = "fixed"
+#: Motion of the head relative to the cameras.
+Head = Literal["free", "fixed"]
 
 
-class Focal(StrEnum):
-    """Whether focal lengths are calibrated or estimated."""
-
-    known = "known"
-    free = "free"
+#: Whether focal lengths are calibrated or estimated.
+Focal = Literal["known", "free"]
 
 
 ShotArg = Annotated[Path, typer.Argument(help="capture.toml of the shot, or its folder.", show_default=False)]
@@ -67,9 +59,6 @@ FaceFile = Annotated[
     typer.Option(
         help="The face during the shot, as for skin-fit, with the points or columns of --skin.", show_default=False
     ),
-]
-FaceFps = Annotated[
-    float | None, typer.Option(min=0.001, help="Frames per second of the face capture. Default: that of the file.")
 ]
 FaceOffset = Annotated[
     float | None,
@@ -103,17 +92,17 @@ def solve(
     ] = Path("take.csv"),
     overlay: OverlayFile = None,
     report: ReportFile = None,
-    head: Annotated[Head, typer.Option(help="fixed: the cameras are head-mounted.")] = Head.free,
-    focal: Annotated[Focal, typer.Option(help="free: estimate focal lengths from the take.")] = Focal.known,
+    head: Annotated[Head, typer.Option(help="fixed: the cameras are head-mounted.")] = "free",
+    focal: Annotated[Focal, typer.Option(help="free: estimate focal lengths from the take.")] = "known",
     skin: SkinFile = None,
     face: FaceFile = None,
-    face_fps: FaceFps = None,
+    face_fps: Fps = None,
     offset: FaceOffset = None,
     rigid: Rigid = None,
     rest_frame: RestFrame = None,
-    length_unit: UnitOption = LengthUnit.mm,
+    length_unit: UnitOption = "mm",
     skin_only: SkinOnly = False,
-    jobs: Annotated[int, typer.Option(min=1, max=64, help="Number of threads.")] = 2,
+    jobs: Jobs = 2,
     force: Force = False,
     allow_outside: Outside = False,
     prim: Prim = None,
@@ -130,8 +119,7 @@ def solve(
         given = _skin_options(skin, face, face_fps, offset, rigid, rest_frame, length_unit, skin_only)
     stage.check_output(rig, out, overlay, report)
     written = [path for path in (out, overlay, report) if path is not None]
-    for path in written:
-        refuse_existing(path, force)
+    refuse_any(force, *written)
     with progress() as tell:
         found = stage.solve(
             rig,
@@ -140,8 +128,8 @@ def solve(
             prim=prim,
             overlay=overlay,
             report=report,
-            fixed_head=head is Head.fixed,
-            free_focal=focal is Focal.free,
+            fixed_head=head == "fixed",
+            free_focal=focal == "free",
             jobs=jobs,
             allow_outside=allow_outside,
             skin=given,
@@ -166,7 +154,7 @@ def _skin_options(
     from jawusd.pipeline.skin import SkinOptions
 
     if skin is not None and face is not None:
-        return SkinOptions(skin, face, fps, offset_s, unit.value, rigid_bodies(rigid), rest_frame, only)
+        return SkinOptions(skin, face, fps, offset_s, unit, rigid_bodies(rigid), rest_frame, only)
     if skin is not None or face is not None or only:
         raise typer.BadParameter("needs both --skin and --face.", param_hint="--skin")
     return None
@@ -227,19 +215,19 @@ def live(
     osc: Annotated[str | None, typer.Option(metavar="HOST:PORT", help="OSC messages: /jaw/d, /jaw/sigma, ...")] = None,
     view: Annotated[bool, typer.Option("--view", help="Also show the jaw in a page on this machine.")] = False,
     port: Annotated[int, typer.Option(min=0, max=65535, help="Port of the page, or the next free port.")] = 8080,
-    head: Annotated[Head, typer.Option(help="fixed: the cameras are head-mounted.")] = Head.free,
+    head: Annotated[Head, typer.Option(help="fixed: the cameras are head-mounted.")] = "free",
     seconds: Annotated[
         float | None, typer.Option(min=0.1, help="Stop after this time [s].", show_default=False)
     ] = None,
     skin: SkinFile = None,
     face: LiveFaceFile = None,
-    face_fps: FaceFps = None,
+    face_fps: Fps = None,
     offset: LiveFaceOffset = 0.0,
     rigid: Rigid = None,
     rest_frame: RestFrame = None,
-    length_unit: UnitOption = LengthUnit.mm,
+    length_unit: UnitOption = "mm",
     silence: Annotated[float, typer.Option(min=0.1, help="Maximum time without an image from a source [s].")] = 10.0,
-    jobs: Annotated[int, typer.Option(min=1, max=64, help="Number of threads.")] = 2,
+    jobs: Jobs = 2,
     allow_outside: Outside = False,
     prim: Prim = None,
     allow: Allow = None,
@@ -264,7 +252,7 @@ def live(
         shot,
         sources,
         prim=prim,
-        fixed_head=head is Head.fixed,
+        fixed_head=head == "fixed",
         jobs=jobs,
         seconds=seconds,
         silence_s=silence,

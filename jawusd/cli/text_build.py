@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from jawusd.pipeline.build import BuildSummary, PlannedStage
     from jawusd.pipeline.fit import FitSummary
     from jawusd.pipeline.many import Outcome
-    from jawusd.pipeline.report import ReportSummary
+    from jawusd.pipeline.state import ReportSummary
     from jawusd.pipeline.track import FrameTrackSummary, TrackSummary
 
 

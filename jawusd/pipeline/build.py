@@ -23,14 +23,22 @@ from jawusd.pipeline.fit import FitSummary, fit_subject, fit_summary
 from jawusd.pipeline.report import (
     BuildFacts,
     CheckResult,
-    ReportSummary,
     missing_packages,
     relative_capture_path,
     write_build_report,
 )
 from jawusd.pipeline.scans import all_labelled, store_labels, with_stored_labels
 from jawusd.pipeline.segment_record import delete_masks
-from jawusd.pipeline.state import CALIBRATION, FIRST_PASS, LABELS, Progress, StageRecord, no_progress, origin_now
+from jawusd.pipeline.state import (
+    CALIBRATION,
+    FIRST_PASS,
+    LABELS,
+    Progress,
+    ReportSummary,
+    StageRecord,
+    no_progress,
+    origin_now,
+)
 from jawusd.pipeline.subject import subject_of_capture
 from jawusd.pipeline.track import TrackSummary, first_pass, model_pass, track_summary
 from jawusd.pipeline.workspace import DryWorkspace, Stage, StageMissing, Workspace, check_folder, open_capture, opened

@@ -43,17 +43,18 @@ _SHORTEST_UP = 0.5
 LEAST_FIT, _CLEAR_FIT, _CLEAR_FIT_SINGLE = 0.15, 0.25, 0.4
 
 T = TypeVar("T")
+T_co = TypeVar("T_co", covariant=True)
 
 
-class StartInFrame(Protocol[T]):
+class StartInFrame(Protocol[T_co]):
     """An estimate of the pose in one frame; see `tracking.region.picture_start`."""
 
     def at(
         self, sources: Sequence[CameraSource], cameras: Mapping[str, Camera], offsets: Mapping[str, int], frame: int
-    ) -> T | None:
+    ) -> T_co | None:
         """Return the most likely pose in a frame with rough masks, or None."""
 
-    def picked(self, bootstrap: Bootstrap, cameras: Mapping[str, Camera]) -> T:
+    def picked(self, bootstrap: Bootstrap, cameras: Mapping[str, Camera]) -> T_co:
         """Return the pose from picks in two or more cameras."""
 
 

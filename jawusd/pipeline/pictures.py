@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from jawusd.base.arrays import Array
 from jawusd.base.errors import explain_missing_packages
 from jawusd.formats.capture import Capture
 from jawusd.formats.mesh import Mesh
@@ -22,6 +23,7 @@ from jawusd.pipeline.cameras import (
     load_cameras,
     open_backdrops,
     open_footage,
+    open_videos,
     tracked_cameras,
     tracked_scans,
 )
@@ -50,31 +52,38 @@ def draw_worst_frames(capture: Capture, offsets: Mapping[str, int], tracks: Trac
         FormatError: the tracks belong to another capture.
     """
     check_same_cameras(capture, tracks)
-    cameras, videos = open_footage(capture, tracks)
-    backdrops = {name: one for name, one in open_backdrops(capture, offsets).items() if name in videos}
-    return draw_frames(chosen_frames(tracks, capture.fps), tracks, cameras, backdrops, tracked_scans(capture, tracks))
+    return draw_frames(capture, offsets, tracks, chosen_frames(tracks, capture.fps), open_videos(capture))
 
 
 def draw_frames(
-    chosen: Sequence[tuple[int, str]],
+    capture: Capture,
+    offsets: Mapping[str, int],
     tracks: Tracks,
-    cameras: Mapping[str, Camera],
-    backdrops: Mapping[str, Backdrop],
-    scans: tuple[Mesh, Mesh],
+    chosen: Sequence[tuple[int, str]],
+    names: Collection[str] | None = None,
 ) -> tuple[Overlay, ...]:
-    """Draw the scans over images; each frame is given by its row in the tracks and the reason for drawing it.
+    """Draw the scans over images or masks.
+
+    Args:
+        offsets: frame offset by camera.
+        chosen: the frames, each as its row in the tracks and the reason for drawing it.
+        names: cameras to draw; None: all with a video or masks.
 
     Raises:
-        CaptureError: an image cannot be decoded.
+        CaptureError, CalibrationError: see `load_cameras` and `open_backdrops`.
     """
     from jawusd.media.overlay import encode_jpeg, tracking_sheet
 
-    shown = [cameras[name] for name in backdrops][:_MOST_CAMERAS]
+    cameras, scans = tracked_cameras(load_cameras(capture), tracks), tracked_scans(capture, tracks)
+    backdrops = {n: one for n, one in open_backdrops(capture, offsets).items() if names is None or n in names}
+    shown = [camera for camera in cameras if camera.name in backdrops][:_MOST_CAMERAS]
     found = []
     for row, reason in chosen:
         frame = int(tracks.frames[row])
         sheet = tracking_sheet(tracks, [frame], shown, backdrops, *scans, tile_px=_REPORT_TILE_PX)
         found.append(Overlay(frame, reason, encode_jpeg(sheet, _QUALITY)))
+    for backdrop in backdrops.values():
+        backdrop.close()
     return tuple(found)
 
 
@@ -83,17 +92,32 @@ def chosen_frames(tracks: Tracks, fps: float) -> list[tuple[int, str]]:
     tracked = tracks.tracked()
     uncovered = np.where(tracked, np.fmax.reduce(uncovered_percent(tracks), axis=1), np.nan)
     sigma_mm = np.where(tracked, tracks.sigma_mm.max(axis=1), np.nan)
-    found: list[tuple[int, str]] = []
-    for values, count, words in (
+    worst = (
         (uncovered, _UNCOVERED, "{:.2f} % of the worse arch's masks uncovered"),
         (sigma_mm, _UNCERTAIN, "expected error of {:.2f} mm at the worst landmark"),
-    ):
-        worst = worst_frames(values, tracks.frames, fps, count, [index for index, _ in found])
-        found += [(index, words.format(values[index])) for index in worst]
-    known = np.flatnonzero(np.isfinite(uncovered))
-    if len(known):
-        usual = known[np.argsort(uncovered[known])[len(known) // 2]]
-        found.append((int(usual), f"a typical frame, {uncovered[usual]:.2f} % of the worse arch's masks uncovered"))
+    )
+    usual = uncovered, "a typical frame, {:.2f} % of the worse arch's masks uncovered"
+    return worst_and_usual(tracks, fps, worst, usual)
+
+
+def worst_and_usual(
+    tracks: Tracks, fps: float, worst: Sequence[tuple[Array, int, str]], usual: tuple[Array, str]
+) -> list[tuple[int, str]]:
+    """Return frames with the largest values, and one with the median value, each as its row and the reason in words.
+
+    Args:
+        worst: values (F,) of every frame, NaN if unknown; the largest number of frames; and the words for one, with a
+            placeholder for its value.
+        usual: values (F,), and the words for the frame with the median one.
+    """
+    found: list[tuple[int, str]] = []
+    for values, count, words in worst:
+        rows = worst_frames(values, tracks.frames, fps, count, [row for row, _ in found])
+        found += [(row, words.format(values[row])) for row in rows]
+    values, words = usual
+    if len(known := np.flatnonzero(np.isfinite(values))):
+        row = int(known[np.argsort(values[known])[len(known) // 2]])
+        found.append((row, words.format(values[row])))
     return found
 
 

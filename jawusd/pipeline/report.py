@@ -8,7 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import NotRequired, TypeVar
+from typing import TypeVar
 
 from typing_extensions import TypedDict
 
@@ -32,6 +32,7 @@ from jawusd.pipeline.state import (
     LABELS,
     BuildState,
     Progress,
+    ReportSummary,
     Stages,
     locked,
     no_progress,
@@ -54,16 +55,6 @@ class CheckResult(TypedDict):
     """Findings of the check before the first stage."""
 
     findings: list[FoundJson]
-
-
-class ReportSummary(TypedDict):
-    """Path of the capture relative to the rig, origin of the build, and the report's file or the missing packages."""
-
-    capture: NotRequired[str]
-    origin: NotRequired[dict[str, object]]
-    file: NotRequired[str]
-    verdict: NotRequired[BuildVerdict]
-    missing: NotRequired[str]
 
 
 @dataclass(frozen=True)

@@ -13,10 +13,10 @@ from jawusd.base.errors import FormatError, OutputError, explain_missing_package
 from jawusd.formats.capture import Capture
 from jawusd.formats.performance import SolveState
 from jawusd.formats.report import Overlay, SolveReportData
-from jawusd.formats.tracks import Tracks, load_tracks, worst_frames
+from jawusd.formats.tracks import Tracks, load_tracks
 from jawusd.pipeline.calibrate import sync_cameras
-from jawusd.pipeline.cameras import check_same_cameras, load_cameras, open_backdrops, tracked_cameras, tracked_scans
-from jawusd.pipeline.pictures import draw_frames
+from jawusd.pipeline.cameras import check_same_cameras
+from jawusd.pipeline.pictures import draw_frames, worst_and_usual
 from jawusd.pipeline.report import attempt, camera_facts
 from jawusd.pipeline.state import Progress, make_folder, package_versions
 from jawusd.pipeline.workspace import open_capture
@@ -102,7 +102,8 @@ def _write(
         left_out.append("images and cameras: no shot was given (--capture).")
     else:
         shot = capture
-        overlays = attempt("pictures", left_out, lambda: _overlays(shot, offsets, tracks))
+        chosen = frames_to_show(tracks, shot.fps)
+        overlays = attempt("pictures", left_out, lambda: draw_frames(shot, offsets, tracks, chosen))
     progress("report", 1, 2)
     data = SolveReportData(
         shot=name,
@@ -126,16 +127,6 @@ def _rate(tracks: Tracks) -> float:
     return rate
 
 
-def _overlays(capture: Capture, offsets: Mapping[str, int], tracks: Tracks) -> tuple[Overlay, ...]:
-    backdrops = open_backdrops(capture, offsets)
-    cameras = {camera.name: camera for camera in tracked_cameras(load_cameras(capture), tracks)}
-    chosen = frames_to_show(tracks, capture.fps)
-    found = draw_frames(chosen, tracks, cameras, backdrops, tracked_scans(capture, tracks))
-    for backdrop in backdrops.values():
-        backdrop.close()
-    return found
-
-
 def frames_to_show(tracks: Tracks, fps: float) -> list[tuple[int, str]]:
     """Return the frames to inspect, each as its row in the tracks and the reason.
 
@@ -146,22 +137,16 @@ def frames_to_show(tracks: Tracks, fps: float) -> list[tuple[int, str]]:
     if solved is None:
         raise ValueError("the tracks have no solved performance")
     sigma, seen = solved.sigma_mm.max(axis=1), solved.state == SolveState.SOLVED
-    found: list[tuple[int, str]] = []
-    for has, badness, most, words in (
+    worst = (
         (solved.state == SolveState.LOST, sigma, _MOST_UNSEEN, "lost, expected error up to {:.2f} mm"),
         (solved.state == SolveState.CARRIED, sigma, _MOST_UNSEEN, "occluded, expected error up to {:.2f} mm"),
         (solved.state == SolveState.SKIN, sigma, _MOST_UNSEEN, "estimated from skin, expected error up to {:.2f} mm"),
         (~solved.valid, -solved.margin_mm, _MOST_OUTSIDE, "{:.2f} mm outside the rig's bound, more than its tolerance"),
         (seen, sigma, _MOST_UNCERTAIN, "solved, with one of the largest expected errors, {:.2f} mm"),
-    ):
-        values = np.where(has, badness, np.nan)
-        rows = worst_frames(values, tracks.frames, fps, most, [row for row, _ in found])
-        found += [(row, words.format(values[row])) for row in rows]
-    if seen.any():
-        rows_seen = np.flatnonzero(seen)
-        usual = int(rows_seen[np.argsort(sigma[rows_seen])[len(rows_seen) // 2]])
-        found.append((usual, f"a typical frame, expected error {sigma[usual]:.2f} mm"))
-    return found
+    )
+    rows = [(np.where(has, badness, np.nan), most, words) for has, badness, most, words in worst]
+    usual = np.where(seen, sigma, np.nan), "a typical frame, expected error {:.2f} mm"
+    return worst_and_usual(tracks, fps, rows, usual)
 
 
 def solve_limits(cameras: Sequence[str]) -> str:

@@ -18,7 +18,7 @@ from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path, PurePosixPath
-from typing import Generic, TypeVar
+from typing import Generic, NotRequired, TypeVar
 
 from typing_extensions import TypedDict
 
@@ -189,10 +189,14 @@ def _record(found: Mapping[str, object]) -> StageRecord[Mapping[str, object]]:
     return StageRecord(inputs, outputs, float(seconds), result)
 
 
-class _Reported(TypedDict, total=False):
-    """The verdict, as stored in the result of the stage that writes the report."""
+class ReportSummary(TypedDict):
+    """Path of the capture relative to the rig, origin of the build, and the report's file or the missing packages."""
 
-    verdict: BuildVerdict
+    capture: NotRequired[str]
+    origin: NotRequired[dict[str, object]]
+    file: NotRequired[str]
+    verdict: NotRequired[BuildVerdict]
+    missing: NotRequired[str]
 
 
 def recorded_verdict(folder: Path) -> str | None:
@@ -202,7 +206,7 @@ def recorded_verdict(folder: Path) -> str | None:
     `changed_files` reports.
     """
     try:
-        found = BuildState(folder).result("report", _Reported)
+        found = BuildState(folder).result("report", ReportSummary)
     except FormatError:
         return None
     return verdict_sentence(found["verdict"]) if found and "verdict" in found else None

@@ -17,8 +17,7 @@ from typer.testing import CliRunner
 
 from jawusd import __version__
 from jawusd.base import errors
-from jawusd.cli.commands import EXIT_CODES, GROUPS, SUMMARIES, help_row, with_vectors_split
-from jawusd.cli.examples import EXAMPLES
+from jawusd.cli.commands import EXAMPLES, EXIT_CODES, GROUPS, SUMMARIES, help_row, with_vectors_split
 from jawusd.cli.main import app
 from jawusd.cli.text_build import build_lines, rounded_duration
 

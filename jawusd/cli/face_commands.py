@@ -1,0 +1,348 @@
+"""Commands on faces: learn jaw motion (`skin-fit`, `arkit-fit`), `align` a model, and judge it (`validate --face`)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, NamedTuple
+
+import typer
+
+from jawusd.cli.options import Allow, Force, Json, Prim, RigArg, UnitOption
+from jawusd.cli.output import emit, refuse_any
+from jawusd.formats.atomic import refuse_existing
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from jawusd.base.arrays import Array
+    from jawusd.evaluator import JawRig
+    from jawusd.evaluator.skin import Skin
+    from jawusd.evaluator.verdicts import Verdicts
+    from jawusd.fitting.face_judging import JudgedFace
+    from jawusd.formats.alignment import Alignment
+    from jawusd.formats.face_table import FaceTable
+
+
+_GUESSES = {"chin": "a chin rigid with the bone", "mean": "the mean d", "carried": "the last d"}
+
+
+TakeArg = Annotated[
+    Path,
+    typer.Argument(
+        help="The jaw of a take: tracks.npz, the CSV of solve, or a table of d or poses.", show_default=False
+    ),
+]
+FaceArg = Annotated[
+    Path,
+    typer.Argument(
+        help="The face of the same take: C3D, TRC or another marker table, the CSV of Live Link Face, or a CSV of "
+        "columns or points.",
+        show_default=False,
+    ),
+]
+Out = Annotated[Path, typer.Option("-o", "--out", help="Learned map to write (.npz).")]
+Fps = Annotated[
+    float | None, typer.Option(min=0.001, help="Frames per second of the face capture. Default: that of the file.")
+]
+JawFps = Annotated[
+    float | None, typer.Option(min=0.001, help="Frames per second of the jaw. Default: that of the tracks or the rig.")
+]
+Offset = Annotated[
+    float | None,
+    typer.Option(help="Time from frame 0 of the jaw to frame 0 of the face [s]. Default: estimated from the motion."),
+]
+Bites = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="FIRST-LAST",
+        help="Frames of the jaw with closed lips and the teeth in occlusion, such as 1200-1260. Repeatable.",
+        show_default=False,
+    ),
+]
+Rigid = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="head=MARKERS",
+        help="Markers fixed to the head; points are expressed relative to them: names, numbers, or a "
+        "marker description. Names and numbers need --rest-frame. Default: the points are stabilised.",
+        show_default=False,
+    ),
+]
+RestFrame = Annotated[
+    int | None, typer.Option(help="For --rigid: frame of the face that defines the marker positions on the head.")
+]
+HeadError = Annotated[
+    tuple[float, float],
+    typer.Option(
+        min=0.0,
+        metavar="MM DEGREES",
+        help="Additional standard deviation of the head-stabilisation error in later takes, relative to this take.",
+    ),
+]
+
+
+def skin_fit(
+    rig: RigArg,
+    take: TakeArg,
+    face: FaceArg,
+    out: Out = Path("skin.npz"),
+    fps: Fps = None,
+    jaw_fps: JawFps = None,
+    offset: Offset = None,
+    bite: Bites = None,
+    rigid: Rigid = None,
+    rest_frame: RestFrame = None,
+    length_unit: UnitOption = "mm",
+    head_error: HeadError = (0.3, 0.15),
+    force: Force = False,
+    prim: Prim = None,
+    allow: Allow = None,
+    as_json: Json = False,
+) -> None:
+    """Learn d from facial skin in frames with visible teeth, to estimate the jaw in frames with closed lips.
+
+    Points must be relative to the head: stabilised, or with --rigid head=MARKERS. The take must contain the jaw
+    exercises, speech with visible teeth, every expression, and a few seconds of occlusion (--bite).
+    """
+    import math
+
+    from jawusd.cli.options import rigid_bodies
+    from jawusd.pipeline.skin import read_face
+
+    refuse_existing(out, force)
+    bites = [_frames(text) for text in bite or ()]
+    seen = read_face(face, fps, length_unit, rigid_bodies(rigid), rest_frame)
+    error = (head_error[0], math.radians(head_error[1]))
+    _learn(rig, take, seen, out, jaw_fps, offset, prim, as_json, bites, error)
+
+
+def arkit_fit(
+    rig: RigArg,
+    face: Annotated[Path, typer.Argument(help="ARKit face capture, the CSV of Live Link Face.", show_default=False)],
+    take: TakeArg,
+    out: Out = Path("arkit.npz"),
+    fps: Fps = None,
+    jaw_fps: JawFps = None,
+    offset: Offset = None,
+    force: Force = False,
+    prim: Prim = None,
+    allow: Allow = None,
+    as_json: Json = False,
+) -> None:
+    """Learn d from the four ARKit jaw weights, as skin-fit does from all blend shapes, for `animate` and `arkit-table`.
+
+    Face and jaw must be captured together. The subject must open the jaw wide, and move it to both sides and forward.
+    """
+    from jawusd.pipeline.skin import read_jaw_weights
+
+    refuse_existing(out, force)
+    _learn(rig, take, read_jaw_weights(face, fps), out, jaw_fps, offset, prim, as_json, weights=True)
+
+
+def _learn(
+    rig: Path,
+    take: Path,
+    face: FaceTable,
+    out: Path,
+    jaw_fps: float | None,
+    offset: float | None,
+    prim: str | None,
+    as_json: bool,
+    bites: Sequence[tuple[int, int]] = (),
+    head_error: tuple[float, float] = (0.0, 0.0),
+    weights: bool = False,
+) -> None:
+    """Learn d from a face, or from its four jaw weights alone, and write and print the result."""
+    import jawusd
+    from jawusd.cli.animate_commands import rate_of
+    from jawusd.pipeline.skin import learn_jaw_weights, learn_skin, read_jaw
+
+    loaded = jawusd.load(rig, prim=prim)
+    jaw = read_jaw(loaded, take)
+    jaw = jaw.at_rate(jaw_fps or jaw.fps or rate_of(rig, prim))
+    for first, last in bites:
+        jaw = jaw.with_bite(first, last)
+    if face.fps is None:
+        raise typer.BadParameter("is needed: the face capture does not state a frame rate.", param_hint="--fps")
+    learn = learn_jaw_weights if weights else learn_skin
+    skin, offset_s = learn(loaded, jaw, face, offset, head_error)
+    jawusd.save_skin(out, skin)
+    emit({"file": str(out), "offset_s": offset_s, **skin.meta}, as_json, lambda: _skin_lines(out, skin, offset_s))
+
+
+def _skin_lines(out: Path, skin: Skin, offset_s: float) -> list[str]:
+    errors = skin.errors_mm
+    what = f"{skin.columns // 3} points" if skin.points else f"{skin.columns} columns"
+    guesses = ", ".join(f"{words} {errors[name]:.2f}" for name, words in _GUESSES.items() if name in errors)
+    return [
+        f"{out}: {what}, {skin.meta['frames']} frames with a known jaw, face {offset_s:.3f} s after the jaw's frame 0",
+        f"held-out error at the incisal point {errors['skin']:.2f} mm; {guesses}",
+        f"{skin.meta['false_alarms']:.1%} of the held-out frames would be flagged as unfamiliar",
+    ]
+
+
+def _frames(text: str) -> tuple[int, int]:
+    first, _, last = text.partition("-")
+    if not (first.isdigit() and last.isdigit() and int(first) <= int(last)):
+        raise typer.BadParameter(f'"{text}" is not of the form FIRST-LAST, such as 1200-1260.', param_hint="--bite")
+    return int(first), int(last)
+
+
+def align(
+    rig: RigArg,
+    correspondences: Annotated[
+        Path, typer.Argument(help="Points of the face model and of the rig (JSON).", show_default=False)
+    ],
+    out: Annotated[Path, typer.Option("-o", "--out", help="Alignment to write (JSON).")] = Path("T_skull_model.json"),
+    force: Force = False,
+    prim: Prim = None,
+    allow: Allow = None,
+    as_json: Json = False,
+) -> None:
+    """Align a face model (FLAME, SMPL-X, ICT-FaceKit, any) with the skull frame of a rig, by a few named points.
+
+    The rig provides the lower incisal point, first molars and condyles; other points, such as the chin, need their
+    position in the skull frame. The command prints the expected error at the teeth and the condyles.
+    """
+    import jawusd
+    from jawusd.base.errors import naming_file
+    from jawusd.formats.alignment import load_correspondences, save_alignment
+
+    refuse_existing(out, force)
+    loaded, given = jawusd.load(rig, prim=prim), load_correspondences(correspondences)
+    points = given.points
+    with naming_file(correspondences):
+        found = jawusd.align(
+            loaded,
+            {name: point.model for name, point in points.items()},
+            {name: point.rig for name, point in points.items() if point.rig is not None},
+            sigma_mm={name: point.sigma_mm for name, point in points.items()},
+            unit_mm=given.unit_mm,
+            scale=given.scale,
+            joint=given.joint,
+        )
+    save_alignment(out, found)
+    emit({"file": str(out), **found.model_dump(mode="json")}, as_json, lambda: _align_lines(out, found, given.scale))
+
+
+def _align_lines(out: Path, found: Alignment, scale: bool) -> list[str]:
+    unit = f"; a model unit is {found.unit_mm:.4g} mm" if scale else ""
+    return [
+        f"{out}: from {len(found.off_mm)} points{unit}",
+        f"expected error {found.teeth_mm:.2f} mm at the teeth, {found.condyles_mm:.2f} mm at the condyles",
+        "distances after the fit [mm]: " + ", ".join(f"{name} {off:.1f}" for name, off in found.off_mm.items()),
+    ]
+
+
+FaceOption = Annotated[
+    Path | None,
+    typer.Option(
+        help="Face track: npz of jaw poses (FLAME, SMPL-X) or CSV of matrices in the model's frame, with --align; or "
+        "the CSV of Live Link Face.",
+        show_default=False,
+    ),
+]
+AlignOption = Annotated[
+    Path | None, typer.Option(help="For --face: the alignment of `jawusd align`.", show_default=False)
+]
+MappingOption = Annotated[
+    Path | None,
+    typer.Option(help="For --face of ARKit weights: a mapping of arkit-fit or skin-fit.", show_default=False),
+]
+CsvOption = Annotated[Path | None, typer.Option(help="For --face: table of verdicts to write.", show_default=False)]
+StripOption = Annotated[
+    Path | None,
+    typer.Option(
+        help="For --face: image to write (PNG): green is inside, amber within the tolerance, red invalid.",
+        show_default=False,
+    ),
+]
+#: Exit code of a negative result, such as an invalid pose or a rig with errors.
+NO = 1
+
+
+class FaceOptions(NamedTuple):
+    """The options of `jawusd validate --face`."""
+
+    align: Path | None
+    mapping: Path | None
+    csv: Path | None
+    strip: Path | None
+    force: bool
+    residual_mm: float | None
+    tolerance_mm: float | None
+
+
+def validate_face(rig: Path, face: Path, options: FaceOptions, prim: str | None, as_json: bool) -> None:
+    """Print the verdicts on a face track, and write their table and strip; exit code 1 if a frame is invalid."""
+    import jawusd
+    from jawusd.fitting.face_judging import save_verdicts
+
+    refuse_any(options.force, options.csv, options.strip)
+    judged = _judged(jawusd.load(rig, prim=prim), face, options)
+    verdicts = judged.verdicts
+    if options.csv is not None:
+        save_verdicts(options.csv, judged)
+    if options.strip is not None:
+        from jawusd.report.strip import save_strip
+
+        save_strip(options.strip, judged.frames, verdicts)
+    rows, counts, words = counted(judged.frames, verdicts)
+    widened = f"{judged.widened_mm:.2f} mm for the alignment"
+    summary = f"{len(rows)} frames: {words} (tolerance {verdicts.tolerance_mm:.2f} mm, of which {widened})"
+    result = {"frames": len(rows), **counts, "widened_mm": judged.widened_mm, "verdicts": rows}
+    emit(result, as_json, lambda: [*verdict_lines(rows), summary])
+    if counts["invalid"]:
+        raise typer.Exit(NO)
+
+
+def _judged(rig: JawRig, face: Path, options: FaceOptions) -> JudgedFace:
+    import numpy as np
+
+    from jawusd.fitting.face_judging import JudgedFace, judge_jaw_track
+    from jawusd.formats.alignment import load_alignment
+    from jawusd.formats.face_table import header_of
+
+    if face.suffix.lower() == ".csv" and "timecode" in header_of(face):
+        from jawusd.cli.animate_commands import read_face
+
+        if options.align is not None:
+            raise typer.BadParameter("does not apply to ARKit weights.", param_hint="--align")
+        motion = read_face(rig, face, None, options.mapping)
+        known = np.isfinite(motion.d).all(axis=1)
+        T = rig.pose(motion.d[known])
+        verdicts = rig.validate(T, residual_limit_mm=options.residual_mm, tolerance_mm=options.tolerance_mm)
+        return JudgedFace(motion.frames[known], verdicts, np.zeros(int(known.sum())), 0.0)
+    if options.align is None:
+        raise typer.BadParameter("is needed: write it with `jawusd align`.", param_hint="--align")
+    return judge_jaw_track(rig, face, load_alignment(options.align), options.residual_mm, options.tolerance_mm)
+
+
+def counted(
+    frames: Array | NDArray[np.int64], verdicts: Verdicts
+) -> tuple[list[dict[str, object]], dict[str, int | float], str]:
+    """Return the verdicts on frames (F,) as rows for JSON, and their numbers for JSON and in words."""
+    rows = _verdict_rows(frames, verdicts)
+    inside, valid = int((verdicts.valid & verdicts.inside()).sum()), int(verdicts.valid.sum())
+    counts = {"inside": inside, "within_tolerance": valid - inside, "invalid": len(rows) - valid}
+    words = f"{inside} inside, {valid - inside} within tolerance, {len(rows) - valid} invalid"
+    return rows, {**counts, "tolerance_mm": verdicts.tolerance_mm}, words
+
+
+def _verdict_rows(frames: Array | NDArray[np.int64], verdicts: Verdicts) -> list[dict[str, object]]:
+    return [
+        {"frame": int(frame), "valid": bool(ok), "reason": words, "residual_mm": float(res), "margin_mm": float(margin)}
+        for frame, ok, words, res, margin in zip(
+            frames, verdicts.valid, verdicts.words(), verdicts.residual_mm, verdicts.margin_mm, strict=True
+        )
+    ]
+
+
+def verdict_lines(rows: Sequence[Mapping[str, object]]) -> list[str]:
+    """Return a line for each frame that is not inside the bound."""
+    from jawusd.evaluator.verdicts import INSIDE
+
+    shown = "frame {frame}: {reason} (residual {residual_mm:.2f} mm, margin {margin_mm:.2f} mm)"
+    return [shown.format(**row) for row in rows if row["reason"] != INSIDE]
