@@ -286,7 +286,7 @@ def validate_face(rig: Path, face: Path, options: FaceOptions, prim: str | None,
     if options.csv is not None:
         save_verdicts(options.csv, judged)
     if options.strip is not None:
-        from jawusd.report.strip import save_strip
+        from jawusd.report.figures import save_strip
 
         save_strip(options.strip, judged.frames, verdicts)
     rows, counts, words = counted(judged.frames, verdicts)

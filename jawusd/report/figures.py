@@ -1,4 +1,4 @@
-"""Figures of a build over its frames, of the synchronisation, and of ranges of motion."""
+"""Figures of a build over its frames, of the synchronisation, of ranges of motion, and of verdicts."""
 
 from __future__ import annotations
 
@@ -10,12 +10,14 @@ from pathlib import Path
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
 from jawusd.base.arrays import Array, Mask
 from jawusd.base.errors import shown
 from jawusd.evaluator import JawRig
 from jawusd.evaluator.motions import motions_of_poses
+from jawusd.evaluator.verdicts import Verdicts
 from jawusd.formats.atomic import write_bytes_atomic
 from jawusd.formats.clips import LightCurve
 from jawusd.formats.model import JawModel
@@ -311,3 +313,33 @@ def ranges_figure(people: Sequence[tuple[str, dict[str, list[float]]]]) -> Figur
     axes[0].set_yticks(rows, [shown(name)[:30] for name, _ in drawn])
     axes[0].invert_yaxis()
     return figure
+
+
+_INKS = (GREEN, ORANGE, VERMILION)
+_WORDS = ("inside", "within tolerance", "invalid")
+
+
+def save_strip(path: Path, frames: Array, verdicts: Verdicts) -> None:
+    """Write an image of verdicts on frames (F,): green is inside, amber within the tolerance, red invalid.
+
+    Plots of the margin to the bound and of the distance from the model [mm] are below the strip.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    kind = np.where(verdicts.valid, np.where(verdicts.inside(), 0, 1), 2)
+    figure, (strip, lines) = new_figure(9.0, 2.6, 2, 1, sharex=True, height_ratios=[1.0, 3.0])
+    for index, ink in enumerate(_INKS):
+        strip.bar(frames[kind == index], 1.0, width=1.0, color=ink)
+    strip.set_yticks([])
+    strip.set_ylim(0.0, 1.0)
+    counts = [f"{words} {int((kind == index).sum())}" for index, words in enumerate(_WORDS)]
+    handles = [Patch(color=ink, label=label) for ink, label in zip(_INKS, counts, strict=True)]
+    strip.legend(handles=handles, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=3, frameon=False)
+    lines.plot(frames, verdicts.margin_mm, color="black", label="margin to the bound")
+    lines.plot(frames, verdicts.residual_mm, color="grey", linestyle="--", label="distance from the model")
+    lines.axhline(-verdicts.tolerance_mm, color="grey", linewidth=0.5)
+    lines.set_xlabel("frame")
+    lines.set_ylabel("mm")
+    lines.legend(frameon=False)
+    write_bytes_atomic(path, figure_bytes(figure, "png", DPI))

@@ -10,8 +10,7 @@ import viser
 from jawusd.formats.tracks import Tracks
 from jawusd.viewer.motion import Player
 from jawusd.viewer.picking import SIDES, PickBook
-from jawusd.viewer.plots import Plot, plot_seek, with_playhead
-from jawusd.viewer.take_plots import coverage_plot, frame_html, frames_to_inspect, solve_plot
+from jawusd.viewer.plots import Plot, coverage_plot, frame_html, frames_to_inspect, plot_seek, solve_plot, with_playhead
 from jawusd.viewer.viewed import Look, ViewedCapture
 from jawusd.viewer.widgets import Choice, add_dark_checkbox, assign, enable, guarded, notify, small_text
 

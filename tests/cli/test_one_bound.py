@@ -42,10 +42,10 @@ from jawusd.rig.bake import bake_rig
 from jawusd.rig.onnx_sidecar import decode_model
 from jawusd.rig.rules import check_bounds
 from jawusd.solvers import JawLayer
+from jawusd.viewer.plots import solve_html
 from jawusd.viewer.pose_panel import verdict_html
 from jawusd.viewer.readouts import measure_pose
 from jawusd.viewer.session import Session
-from jawusd.viewer.take_plots import solve_html
 
 COUNT, TOLERANCE_MM, UNDECIDED_MM = 5000, 1.0, 1e-6
 ARRAYS = example_arrays() | {"tolerance_mm": np.array(TOLERANCE_MM)}

@@ -5,7 +5,7 @@ from report_data import report_data
 
 from jawusd.formats.tracks import uncovered_percent, worst_frames
 from jawusd.pipeline.pictures import chosen_frames
-from jawusd.viewer.take_plots import frames_to_inspect
+from jawusd.viewer.plots import frames_to_inspect
 
 
 def take():

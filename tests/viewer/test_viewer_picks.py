@@ -9,8 +9,7 @@ from jawusd.formats.mesh import Mesh
 from jawusd.formats.tracks import LOST, TRACKED, Tracks, uncovered_percent
 from jawusd.geometry import make_transform, random_rotation, transform_points
 from jawusd.viewer.picking import FOV_RAD, PickBook, PickingLayout, fit_view, hit_vertex, region_around
-from jawusd.viewer.plots import with_playhead
-from jawusd.viewer.take_plots import coverage_plot, frame_html, frames_to_inspect
+from jawusd.viewer.plots import coverage_plot, frame_html, frames_to_inspect, with_playhead
 
 
 def filled():
