@@ -28,7 +28,6 @@ RetargetFrom = Annotated[
     typer.Option(
         help="Rig for which the source was made; the source may then also be an animation layer.",
         callback=rig_of_folder,
-        show_default=False,
     ),
 ]
 
@@ -111,20 +110,17 @@ def _write(
 def animate(
     rig: RigArg,
     source: Annotated[
-        Path | None,
-        typer.Argument(help="keys.json, a CSV of d or of poses, a stage, .fbx or .glb.", show_default=False),
+        Path | None, typer.Argument(help="keys.json, a CSV of d or of poses, a stage, .fbx or .glb.")
     ] = None,
     retarget_from: RetargetFrom = None,
     arkit: Annotated[
-        Path | None,
-        typer.Option(help="ARKit face capture instead of SOURCE: the CSV of Live Link Face.", show_default=False),
+        Path | None, typer.Option(help="ARKit face capture instead of SOURCE: the CSV of Live Link Face.")
     ] = None,
     mapping: Annotated[
         Path | None,
         typer.Option(
             help="The actor's map from ARKit weights to d, written by arkit-fit or skin-fit. "
-            "Default: fractions of the ranges.",
-            show_default=False,
+            "Default: fractions of the ranges."
         ),
     ] = None,
     out: Annotated[Path, typer.Option("-o", "--out", help="Animation layer, or .glb for the web.")] = Path("anim.usdc"),
@@ -170,10 +166,7 @@ def arkit_table(
     rig: RigArg,
     out: Annotated[Path, typer.Option("-o", "--out", help="Table to write (CSV).")] = Path("joint.csv"),
     mapping: Annotated[
-        Path | None,
-        typer.Option(
-            help="The actor's map, written by arkit-fit. Default: fractions of the ranges.", show_default=False
-        ),
+        Path | None, typer.Option(help="The actor's map, written by arkit-fit. Default: fractions of the ranges.")
     ] = None,
     force: Force = False,
     prim: Prim = None,

@@ -50,7 +50,7 @@ BackendOption = Annotated[Backend, typer.Option(help="Renderer of --solver paper
 def build(
     context: typer.Context,
     capture: CaptureArg,
-    out: Annotated[Path, typer.Option("-o", "--out", help="Folder of the rig.", show_default=False)],
+    out: Annotated[Path, typer.Option("-o", "--out", help="Folder of the rig.")],
     model: Annotated[Method, typer.Option(help="Form of the jaw model.")] = "anchored",
     solver: SolverOption = "contour",
     backend: BackendOption = "cpu",
@@ -102,15 +102,11 @@ def track(
     out: Annotated[Path, typer.Option("-o", "--out", help="File of the tracks.")] = Path("tracks.npz"),
     solver: SolverOption = "contour",
     backend: BackendOption = "cpu",
-    prior: Annotated[
-        Path | None,
-        typer.Option(help="model.npz of this subject, as a prior for a second pass.", show_default=False),
-    ] = None,
+    prior: Annotated[Path | None, typer.Option(help="model.npz of this subject, as a prior for a second pass.")] = None,
     overlay: Annotated[
         Path | None,
         typer.Option(
-            help="Folder for videos of the tracked scans over the footage, or an .mp4 of all cameras side by side.",
-            show_default=False,
+            help="Folder for videos of the tracked scans over the footage, or an .mp4 of all cameras side by side."
         ),
     ] = None,
     jobs: Jobs = 2,
@@ -156,8 +152,7 @@ def fit(
     poses: Annotated[
         Path,
         typer.Argument(
-            help="tracks.npz, a CSV of poses, HDF5 of jaw-tracking-system, or with --rigid a table of markers.",
-            show_default=False,
+            help="tracks.npz, a CSV of poses, HDF5 of jaw-tracking-system, or with --rigid a table of markers."
         ),
     ],
     capture: CaptureOption = None,
@@ -193,8 +188,8 @@ def fit(
 
 
 def bake(
-    model: Annotated[Path, typer.Argument(help="model.npz.", show_default=False)],
-    out: Annotated[Path, typer.Option("-o", "--out", help="Folder of the rig.", show_default=False)],
+    model: Annotated[Path, typer.Argument(help="model.npz.")],
+    out: Annotated[Path, typer.Option("-o", "--out", help="Folder of the rig.")],
     capture: CaptureOption = None,
     upper_teeth: UpperOption = None,
     lower_teeth: LowerOption = None,
@@ -221,7 +216,7 @@ def bake(
 
 
 def demo(
-    out: Annotated[Path, typer.Option("-o", "--out", help="Folder of the capture.", show_default=False)],
+    out: Annotated[Path, typer.Option("-o", "--out", help="Folder of the capture.")],
     seed: Annotated[int, typer.Option(min=0, help="Seed of the random subject.")] = 0,
     frames: Annotated[int, typer.Option(min=24, max=20000, help="Number of exercise frames.")] = 240,
     force: Force = False,
@@ -252,12 +247,10 @@ def build_many(
     captures: Annotated[
         Path,
         typer.Argument(
-            metavar="LIST",
-            help="Text file with one capture per line: PATH, or PATH, NAME of its output folder.",
-            show_default=False,
+            metavar="LIST", help="Text file with one capture per line: PATH, or PATH, NAME of its output folder."
         ),
     ],
-    out: Annotated[Path, typer.Option("-o", "--out", help="Parent folder of the rigs' folders.", show_default=False)],
+    out: Annotated[Path, typer.Option("-o", "--out", help="Parent folder of the rigs' folders.")],
     model: Annotated[Method, typer.Option(help="Form of the jaw models.")] = "anchored",
     cluster: Annotated[
         str | None,
@@ -265,12 +258,10 @@ def build_many(
             metavar="ADDRESS",
             help="Dask scheduler, such as tcp://host:8786; its workers need jawusd and the same paths. "
             "Default: local processes.",
-            show_default=False,
         ),
     ] = None,
     workers: Annotated[
-        int | None,
-        typer.Option(min=1, max=1024, help="Number of local processes. Default: one per core.", show_default=False),
+        int | None, typer.Option(min=1, max=1024, help="Number of local processes. Default: one per core.")
     ] = None,
     retries: Annotated[int, typer.Option(min=0, max=100, help="Number of retries after a local process dies.")] = 3,
     resume: Annotated[bool, typer.Option("--resume", help="Continue earlier builds in this folder.")] = False,

@@ -14,16 +14,11 @@ from jawusd.formats.atomic import refuse_existing
 
 
 def init(
-    folder: Annotated[
-        Path | None, typer.Argument(help="Folder with footage, scans and board clips.", show_default=False)
-    ] = None,
+    folder: Annotated[Path | None, typer.Argument(help="Folder with footage, scans and board clips.")] = None,
     square_mm: Annotated[
-        float | None,
-        typer.Option(min=0.1, max=200.0, help="Side of the board's squares [mm].", show_default=False),
+        float | None, typer.Option(min=0.1, max=200.0, help="Side of the board's squares [mm].")
     ] = None,
-    fps: Annotated[
-        float | None, typer.Option(min=0.001, max=10000.0, help="Frames per second.", show_default=False)
-    ] = None,
+    fps: Annotated[float | None, typer.Option(min=0.001, max=10000.0, help="Frames per second.")] = None,
     reference: Annotated[bool, typer.Option("--reference", help="List every key of capture.toml and exit.")] = False,
     force: Force = False,
     as_json: Json = False,
@@ -79,15 +74,13 @@ def cameras(
         Path,
         typer.Argument(
             help="TOML (aniposelib, Pose2Sim, Caliscope), Metashape XML, RealityScan CSV or XMP, COLMAP, "
-            "transforms.json, OpenCV YAML, XML or JSON, Nuke script of 3DEqualizer, or a USD stage.",
-            show_default=False,
+            "transforms.json, OpenCV YAML, XML or JSON, Nuke script of 3DEqualizer, or a USD stage."
         ),
     ],
-    out: Annotated[Path, typer.Option("-o", "--out", help=".toml, .usda, or a folder for COLMAP.", show_default=False)],
+    out: Annotated[Path, typer.Option("-o", "--out", help=".toml, .usda, or a folder for COLMAP.")],
     unit_mm: Annotated[float, typer.Option(min=1e-6, help="Length of the source's unit [mm]: 1000 for metres.")] = 1.0,
     size: Annotated[
-        str | None,
-        typer.Option(help="Image size, such as 1920x1080, if the source does not state it.", show_default=False),
+        str | None, typer.Option(help="Image size, such as 1920x1080, if the source does not state it.")
     ] = None,
     force: Force = False,
     as_json: Json = False,
@@ -128,9 +121,7 @@ def check(capture: CaptureArg, allow_outside: Outside = False, as_json: Json = F
 def calibrate(
     capture: CaptureArg,
     out: Annotated[Path, typer.Option("-o", "--out", help="File of the calibration.")] = Path("calibration.toml"),
-    report_file: Annotated[
-        Path | None, typer.Option("--report", help="Also write the report as JSON.", show_default=False)
-    ] = None,
+    report_file: Annotated[Path | None, typer.Option("--report", help="Also write the report as JSON.")] = None,
     force: Force = False,
     allow_outside: Outside = False,
     as_json: Json = False,
@@ -153,16 +144,10 @@ def calibrate(
 
 def sync(
     clips: Annotated[list[Path], typer.Argument(help="A capture (capture.toml or its folder), or two or more videos.")],
-    reference: Annotated[
-        str | None, typer.Option(help="Name of the reference clip. Default: the first.", show_default=False)
-    ] = None,
-    curves: Annotated[
-        Path | None,
-        typer.Option(help="Also write the brightness of every image as CSV.", show_default=False),
-    ] = None,
+    reference: Annotated[str | None, typer.Option(help="Name of the reference clip. Default: the first.")] = None,
+    curves: Annotated[Path | None, typer.Option(help="Also write the brightness of every image as CSV.")] = None,
     plot: Annotated[
-        Path | None,
-        typer.Option(help="Also draw the brightness before and after alignment, as PNG or SVG.", show_default=False),
+        Path | None, typer.Option(help="Also draw the brightness before and after alignment, as PNG or SVG.")
     ] = None,
     force: Force = False,
     allow_outside: Outside = False,
@@ -227,8 +212,7 @@ def segment(
         typer.Option(
             help="Folder of hand-drawn frames: CAMERA/upper/000123.png, CAMERA/lower/000123.png. These are finished "
             "masks, 255 on teeth and 0 elsewhere, which also teach your style; or strokes, 255 on teeth, 0 on "
-            "other things, and 128 where unknown.",
-            show_default=False,
+            "other things, and 128 where unknown."
         ),
     ] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Keep finished frames.")] = False,
@@ -279,7 +263,6 @@ def scans(
             "--out",
             help="Folder of labels and image; enter it in [scans] labels of the capture. Default: beside the "
             "scans, and the capture's folder.",
-            show_default=False,
         ),
     ] = None,
     force: Annotated[
@@ -299,7 +282,7 @@ def scans(
 
 def plates(
     capture: CaptureArg,
-    rig: Annotated[Path, typer.Argument(help="Folder of the rig built from the capture.", show_default=False)],
+    rig: Annotated[Path, typer.Argument(help="Folder of the rig built from the capture.")],
     force: Force = False,
     allow_outside: Outside = False,
     as_json: Json = False,
@@ -325,13 +308,10 @@ def plates(
 def photos(
     outlines: Annotated[
         list[Path],
-        typer.Argument(
-            help="An image per photograph: tooth outlines as bright lines on black, or filled teeth.",
-            show_default=False,
-        ),
+        typer.Argument(help="An image per photograph: tooth outlines as bright lines on black, or filled teeth."),
     ],
-    upper_teeth: Annotated[Path, typer.Option(help="Scan of the upper teeth, in any frame.", show_default=False)],
-    lower_teeth: Annotated[Path, typer.Option(help="Scan of the lower teeth, in any frame.", show_default=False)],
+    upper_teeth: Annotated[Path, typer.Option(help="Scan of the upper teeth, in any frame.")],
+    lower_teeth: Annotated[Path, typer.Option(help="Scan of the lower teeth, in any frame.")],
     out: Annotated[
         Path, typer.Option("-o", "--out", help="Folder for photos.json and an overlay per photograph.")
     ] = Path("photos"),

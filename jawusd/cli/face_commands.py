@@ -29,17 +29,13 @@ _GUESSES = {"chin": "a chin rigid with the bone", "mean": "the mean d", "carried
 
 
 TakeArg = Annotated[
-    Path,
-    typer.Argument(
-        help="The jaw of a take: tracks.npz, the CSV of solve, or a table of d or poses.", show_default=False
-    ),
+    Path, typer.Argument(help="The jaw of a take: tracks.npz, the CSV of solve, or a table of d or poses.")
 ]
 FaceArg = Annotated[
     Path,
     typer.Argument(
         help="The face of the same take: C3D, TRC or another marker table, the CSV of Live Link Face, or a CSV of "
-        "columns or points.",
-        show_default=False,
+        "columns or points."
     ),
 ]
 Out = Annotated[Path, typer.Option("-o", "--out", help="Learned map to write (.npz).")]
@@ -58,7 +54,6 @@ Bites = Annotated[
     typer.Option(
         metavar="FIRST-LAST",
         help="Frames of the jaw with closed lips and the teeth in occlusion, such as 1200-1260. Repeatable.",
-        show_default=False,
     ),
 ]
 Rigid = Annotated[
@@ -67,7 +62,6 @@ Rigid = Annotated[
         metavar="head=MARKERS",
         help="Markers fixed to the head; points are expressed relative to them: names, numbers, or a "
         "marker description. Names and numbers need --rest-frame. Default: the points are stabilised.",
-        show_default=False,
     ),
 ]
 RestFrame = Annotated[
@@ -120,7 +114,7 @@ def skin_fit(
 
 def arkit_fit(
     rig: RigArg,
-    face: Annotated[Path, typer.Argument(help="ARKit face capture, the CSV of Live Link Face.", show_default=False)],
+    face: Annotated[Path, typer.Argument(help="ARKit face capture, the CSV of Live Link Face.")],
     take: TakeArg,
     out: Out = Path("arkit.npz"),
     fps: Fps = None,
@@ -192,9 +186,7 @@ def _frames(text: str) -> tuple[int, int]:
 
 def align(
     rig: RigArg,
-    correspondences: Annotated[
-        Path, typer.Argument(help="Points of the face model and of the rig (JSON).", show_default=False)
-    ],
+    correspondences: Annotated[Path, typer.Argument(help="Points of the face model and of the rig (JSON).")],
     out: Annotated[Path, typer.Option("-o", "--out", help="Alignment to write (JSON).")] = Path("T_skull_model.json"),
     force: Force = False,
     prim: Prim = None,
@@ -240,24 +232,17 @@ FaceOption = Annotated[
     Path | None,
     typer.Option(
         help="Face track: npz of jaw poses (FLAME, SMPL-X) or CSV of matrices in the model's frame, with --align; or "
-        "the CSV of Live Link Face.",
-        show_default=False,
+        "the CSV of Live Link Face."
     ),
 ]
-AlignOption = Annotated[
-    Path | None, typer.Option(help="For --face: the alignment of `jawusd align`.", show_default=False)
-]
+AlignOption = Annotated[Path | None, typer.Option(help="For --face: the alignment of `jawusd align`.")]
 MappingOption = Annotated[
-    Path | None,
-    typer.Option(help="For --face of ARKit weights: a mapping of arkit-fit or skin-fit.", show_default=False),
+    Path | None, typer.Option(help="For --face of ARKit weights: a mapping of arkit-fit or skin-fit.")
 ]
-CsvOption = Annotated[Path | None, typer.Option(help="For --face: table of verdicts to write.", show_default=False)]
+CsvOption = Annotated[Path | None, typer.Option(help="For --face: table of verdicts to write.")]
 StripOption = Annotated[
     Path | None,
-    typer.Option(
-        help="For --face: image to write (PNG): green is inside, amber within the tolerance, red invalid.",
-        show_default=False,
-    ),
+    typer.Option(help="For --face: image to write (PNG): green is inside, amber within the tolerance, red invalid."),
 ]
 #: Exit code of a negative result, such as an invalid pose or a rig with errors.
 NO = 1

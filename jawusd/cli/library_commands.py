@@ -22,8 +22,7 @@ Use = Literal["average", "closest"]
 
 def retarget(
     anim: Annotated[
-        Path | None,
-        typer.Argument(help="Motion of --from: an animation layer, keys.json, or a CSV of d or poses."),
+        Path | None, typer.Argument(help="Motion of --from: an animation layer, keys.json, or a CSV of d or poses.")
     ] = None,
     source: Annotated[
         Path | None, typer.Option("--from", help="Rig for which the motion was made.", callback=rig_of_folder)
@@ -109,7 +108,7 @@ def _personal(landmarks: Path, folder: Path, use: Use, out: Path, force: bool, a
 
 
 def library(
-    folder: Annotated[Path, typer.Argument(help="Folder with a subfolder per subject.", show_default=False)],
+    folder: Annotated[Path, typer.Argument(help="Folder with a subfolder per subject.")],
     search: Annotated[str | None, typer.Option(help="List only names and paths that contain this text.")] = None,
     like: Annotated[Path | None, typer.Option(help="Sort by similarity to these landmarks (JSON).")] = None,
     compare: Annotated[
@@ -208,15 +207,10 @@ def _compare(first: Entry, second: Entry, as_json: bool) -> None:
 
 def publish(
     source: Annotated[
-        Path,
-        typer.Argument(help="Folder of a rig (with actor.usda), or a shot.", metavar="FOLDER|SHOT", show_default=False),
+        Path, typer.Argument(help="Folder of a rig (with actor.usda), or a shot.", metavar="FOLDER|SHOT")
     ],
-    out: Annotated[
-        Path, typer.Option("-o", "--out", help="Folder to write, or the .usdz of a shot.", show_default=False)
-    ],
-    prefix: Annotated[
-        str | None, typer.Option(help="Prefix of all file names. Default: the actor's name.", show_default=False)
-    ] = None,
+    out: Annotated[Path, typer.Option("-o", "--out", help="Folder to write, or the .usdz of a shot.")],
+    prefix: Annotated[str | None, typer.Option(help="Prefix of all file names. Default: the actor's name.")] = None,
     prim_name: PrimName = None,
     force: Force = False,
     allow: Allow = None,

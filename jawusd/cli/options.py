@@ -28,7 +28,7 @@ Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 Force = Annotated[bool, typer.Option("--force", help="Overwrite an existing output.")]
 Outside = Annotated[bool, typer.Option("--allow-outside", help="Allow paths that point outside the capture's folder.")]
 Jobs = Annotated[int, typer.Option(min=1, max=64, help="Number of threads.")]
-CaptureArg = Annotated[Path, typer.Argument(help="capture.toml or its folder.", show_default=False)]
+CaptureArg = Annotated[Path, typer.Argument(help="capture.toml or its folder.")]
 
 
 def _allow(folders: list[Path] | None) -> list[Path] | None:
@@ -46,7 +46,6 @@ Allow = Annotated[
         callback=_allow,
         help="Folder from which a rig or shot may load files, such as a library; repeatable. "
         "Environment variable: JAWUSD_ALLOW.",
-        show_default=False,
     ),
 ]
 Prim = Annotated[str | None, typer.Option("--prim", help="Path of the rig's prim, if a stage has several rigs.")]
@@ -64,7 +63,6 @@ PrimName = Annotated[
         "--prim-name",
         callback=_prim_name,
         help="Name of the actor's prim and joints. Default: derived from the actor's name.",
-        show_default=False,
     ),
 ]
 
@@ -93,20 +91,11 @@ def changed_in_folder(context: typer.Context) -> list[Finding]:
 
 
 RigArg = Annotated[
-    Path,
-    typer.Argument(
-        help="Folder of a rig, its actor.usda or another layer, or model.npz.",
-        callback=_noted,
-        show_default=False,
-    ),
+    Path, typer.Argument(help="Folder of a rig, its actor.usda or another layer, or model.npz.", callback=_noted)
 ]
 OptionalRigArg = Annotated[
     Path | None,
-    typer.Argument(
-        help="Folder of a rig, actor.usda, another layer, model.npz or tracks.npz.",
-        callback=_noted,
-        show_default=False,
-    ),
+    typer.Argument(help="Folder of a rig, actor.usda, another layer, model.npz or tracks.npz.", callback=_noted),
 ]
 
 
@@ -123,38 +112,26 @@ def load_named(rig: Path, prim: str | None, stage: Path | None = None) -> JawRig
 
 
 # Options that describe the subject.
-CaptureOption = Annotated[Path | None, typer.Option(help="Capture with scans and landmarks.", show_default=False)]
-UpperOption = Annotated[
-    Path | None, typer.Option(help="Scan of the upper teeth, instead of a capture.", show_default=False)
-]
+CaptureOption = Annotated[Path | None, typer.Option(help="Capture with scans and landmarks.")]
+UpperOption = Annotated[Path | None, typer.Option(help="Scan of the upper teeth, instead of a capture.")]
 LowerOption = Annotated[
-    Path | None,
-    typer.Option(help="Scan of the lower teeth, in the same coordinate frame, in occlusion.", show_default=False),
+    Path | None, typer.Option(help="Scan of the lower teeth, in the same coordinate frame, in occlusion.")
 ]
-MandibleOption = Annotated[
-    Path | None, typer.Option(help="Mesh of the mandible, in the same coordinate frame.", show_default=False)
-]
-LandmarksOption = Annotated[
-    Path | None, typer.Option(help="Landmarks (JSON), instead of a capture or scans.", show_default=False)
-]
+MandibleOption = Annotated[Path | None, typer.Option(help="Mesh of the mandible, in the same coordinate frame.")]
+LandmarksOption = Annotated[Path | None, typer.Option(help="Landmarks (JSON), instead of a capture or scans.")]
 
 # Options for the conventions of a file of poses.
 ColumnsOption = Annotated[
-    str | None,
-    typer.Option(
-        help="Column names of a table: frame=Frame,tx=X,ty=Y,tz=Z,qw=W,... or m00=...,m01=...",
-        show_default=False,
-    ),
+    str | None, typer.Option(help="Column names of a table: frame=Frame,tx=X,ty=Y,tz=Z,qw=W,... or m00=...,m01=...")
 ]
 UnitOption = Annotated[LengthUnit, typer.Option(help="Length unit, if the file does not state it.")]
 InvertOption = Annotated[
     bool, typer.Option("--invert", help="Invert the poses: those of the file map skull to mandible.")
 ]
 RestOption = Annotated[
-    int | None,
-    typer.Option(help="Frame with the teeth in occlusion; poses are made relative to it.", show_default=False),
+    int | None, typer.Option(help="Frame with the teeth in occlusion; poses are made relative to it.")
 ]
-GroupOption = Annotated[str | None, typer.Option(help="Trajectory of an HDF5 file.", show_default=False)]
+GroupOption = Annotated[str | None, typer.Option(help="Trajectory of an HDF5 file.")]
 RigidOption = Annotated[
     list[str] | None,
     typer.Option(
@@ -163,7 +140,6 @@ RigidOption = Annotated[
         "Give numbers or names, such as jaw=5,6,7,8 or jaw=JL,JR,JF (with --rest-frame), or a marker description, "
         "such as jaw=jaw.rig. Formats: C3D, TRC, QTM (TSV), Vicon CSV, plain tables of numbers, and ArtiSynth probes "
         "(marker%d.txt). Repeatable.",
-        show_default=False,
     ),
 ]
 

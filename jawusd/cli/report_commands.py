@@ -40,8 +40,7 @@ def report(
     source: Annotated[
         Path,
         typer.Argument(
-            help="Folder of a build, tracks.npz of a solve, or (for experiments) tracks.npz, CSV or HDF5 poses.",
-            show_default=False,
+            help="Folder of a build, tracks.npz of a solve, or (for experiments) tracks.npz, CSV or HDF5 poses."
         ),
     ],
     experiments: Annotated[
@@ -53,7 +52,6 @@ def report(
             "-o",
             "--out",
             help="Folder of the figures, or page of a solve. Default: DIR/experiments, or beside the tracks.",
-            show_default=False,
         ),
     ] = None,
     capture: CaptureOption = None,
@@ -137,9 +135,7 @@ def _report_found(
 
 PageOption = Annotated[
     Path | None,
-    typer.Option(
-        help="Write a web page that poses the rig without a server, and exit.", metavar="FILE.html", show_default=False
-    ),
+    typer.Option(help="Write a web page that poses the rig without a server, and exit.", metavar="FILE.html"),
 ]
 
 
@@ -150,15 +146,11 @@ def view(
             help="A rig (actor.usda, another layer of it, or its folder) or a capture (capture.toml or its folder). "
             "Default: the example rig that ships with jawusd.",
             metavar="RIG|CAPTURE",
-            show_default=False,
         ),
     ] = None,
     tracks: Annotated[
         Path | None,
-        typer.Option(
-            help="Poses to draw over the footage of a capture: the folder of its build, or tracks.npz.",
-            show_default=False,
-        ),
+        typer.Option(help="Poses to draw over the footage of a capture: the folder of its build, or tracks.npz."),
     ] = None,
     host: Annotated[
         str, typer.Option(help="Address to listen on; the default accepts connections only from this machine.")

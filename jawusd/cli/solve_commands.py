@@ -31,34 +31,25 @@ Head = Literal["free", "fixed"]
 Focal = Literal["known", "free"]
 
 
-ShotArg = Annotated[Path, typer.Argument(help="capture.toml of the shot, or its folder.", show_default=False)]
+ShotArg = Annotated[Path, typer.Argument(help="capture.toml of the shot, or its folder.")]
 OverlayFile = Annotated[
-    Path | None,
-    typer.Option(
-        help="Video (.mp4) to write: the solved teeth over the images of all cameras.",
-        show_default=False,
-    ),
+    Path | None, typer.Option(help="Video (.mp4) to write: the solved teeth over the images of all cameras.")
 ]
 ReportFile = Annotated[
     Path | None,
     typer.Option(
-        help="Page (.html) to write: curves with expected errors, frames with hidden teeth, findings, images.",
-        show_default=False,
+        help="Page (.html) to write: curves with expected errors, frames with hidden teeth, findings, images."
     ),
 ]
 SkinFile = Annotated[
     Path | None,
     typer.Option(
         help="For frames with hidden teeth: map from facial skin to d, written by skin-fit, with --face; or the word "
-        "footage, to follow skin in the videos and learn from the frames with visible teeth.",
-        show_default=False,
+        "footage, to follow skin in the videos and learn from the frames with visible teeth."
     ),
 ]
 FaceFile = Annotated[
-    Path | None,
-    typer.Option(
-        help="The face during the shot, as for skin-fit, with the points or columns of --skin.", show_default=False
-    ),
+    Path | None, typer.Option(help="The face during the shot, as for skin-fit, with the points or columns of --skin.")
 ]
 FaceOffset = Annotated[
     float | None,
@@ -70,8 +61,7 @@ LiveFaceFile = Annotated[
     Path | None,
     typer.Option(
         help="The live face with the points or columns of --skin: - for the standard input, a pipe or a growing CSV. "
-        "For recorded cameras, a recording as for skin-fit.",
-        show_default=False,
+        "For recorded cameras, a recording as for skin-fit."
     ),
 ]
 LiveFaceOffset = Annotated[
@@ -209,16 +199,13 @@ def live(
             metavar="NAME=SOURCE",
             help="Source of a camera: NAME=/dev/video0, NAME=rtsp://..., NAME=FILE. Cameras without a source are not "
             "used; without any source, the shot's videos are played in real time.",
-            show_default=False,
         ),
     ] = None,
     osc: Annotated[str | None, typer.Option(metavar="HOST:PORT", help="OSC messages: /jaw/d, /jaw/sigma, ...")] = None,
     view: Annotated[bool, typer.Option("--view", help="Also show the jaw in a page on this machine.")] = False,
     port: Annotated[int, typer.Option(min=0, max=65535, help="Port of the page, or the next free port.")] = 8080,
     head: Annotated[Head, typer.Option(help="fixed: the cameras are head-mounted.")] = "free",
-    seconds: Annotated[
-        float | None, typer.Option(min=0.1, help="Stop after this time [s].", show_default=False)
-    ] = None,
+    seconds: Annotated[float | None, typer.Option(min=0.1, help="Stop after this time [s].")] = None,
     skin: SkinFile = None,
     face: LiveFaceFile = None,
     face_fps: Fps = None,

@@ -34,11 +34,7 @@ SkullPrim = Annotated[
 def encode(
     rig: RigArg,
     poses: Annotated[
-        Path,
-        typer.Argument(
-            help="CSV or JSON of poses, tracks.npz, or a stage, .fbx or .glb with the actor's meshes.",
-            show_default=False,
-        ),
+        Path, typer.Argument(help="CSV or JSON of poses, tracks.npz, or a stage, .fbx or .glb with the actor's meshes.")
     ],
     out: Annotated[Path, typer.Option("-o", "--out", help="CSV of frame, d1, d2, d3, residual_mm, margin_mm.")] = Path(
         "d.csv"
@@ -216,24 +212,16 @@ def rebake(
             help="The shot; or the rig, if STAGE is FBX, glTF or a stage with copies of the rig's meshes.",
             metavar="SHOT | RIG STAGE",
             callback=rig_of_folder,
-            show_default=False,
         ),
     ],
-    stage: Annotated[
-        Path | None, typer.Argument(help="Shot or animation layer, or an export of it.", show_default=False)
-    ] = None,
+    stage: Annotated[Path | None, typer.Argument(help="Shot or animation layer, or an export of it.")] = None,
     out: Annotated[Path | None, typer.Option("-o", "--out", help="Layer to write. Default: <shot>_baked.usdc.")] = None,
     root: Annotated[bool, typer.Option("--root", help="Make the layer a new root that sublayers the shot.")] = False,
-    origin: Annotated[
-        Origin | None, typer.Option("--from", help="Source to use if d and mandible disagree.", show_default=False)
-    ] = None,
+    origin: Annotated[Origin | None, typer.Option("--from", help="Source to use if d and mandible disagree.")] = None,
     mandible: MandiblePrim = None,
     skull: SkullPrim = None,
     prim: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--prim", metavar="PRIM", help="Prim paths of the rigs to bake. Default: all.", show_default=False
-        ),
+        list[str] | None, typer.Option("--prim", metavar="PRIM", help="Prim paths of the rigs to bake. Default: all.")
     ] = None,
     allow: Allow = None,
     force: Force = False,
