@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
-from functools import partial
+from functools import cache
 
 import numpy as np
 
@@ -191,7 +191,7 @@ def picks(parts: Parts) -> Iterator[Finding]:
     )
     guesses = parts.offset_guesses()
     # If the masks of two cameras were swapped, they may be numbered by the frames of either camera.
-    seen = [partial(_pixels, parts, picked.frame, guess, {}, numbered) for guess in guesses for numbered in (0, 1)]
+    seen = [_pixels(parts, picked.frame, guess, numbered) for guess in guesses for numbered in (0, 1)]
     try:
         yield from pick_findings(given, seen, [name for name in parts.cameras if name in parts.samples], picked.frame)
     except JawusdError as error:
@@ -199,26 +199,21 @@ def picks(parts: Parts) -> Iterator[Finding]:
 
 
 def _pixels(
-    parts: Parts,
-    instant: int,
-    offsets: Mapping[str, int],
-    known: dict[tuple[str, str], tuple[Array, Array]],
-    numbered: int,
-    source: str,
-    camera: str,
-) -> tuple[Array, Array]:
-    """Return the mask pixels of camera `source` at one frame, by arch, as if they were the masks of `camera`.
+    parts: Parts, instant: int, offsets: Mapping[str, int], numbered: int
+) -> Callable[[str, str], tuple[Array, Array]]:
+    """Return a function that returns the mask pixels of one camera by arch, as if they were the masks of another.
 
-    `instant` is the frame number of the reference camera.
-
-    `numbered` is 0 if the masks are numbered by the frames of `camera`, and 1 if by the frames of `source`.
+    Args:
+        instant: frame number of the reference camera.
+        numbered: 0 if the masks are numbered by the frames of the other camera, 1 if by those of their own.
     """
-    nothing = np.empty((0, 2))
-    by = (camera, source)[numbered]
-    if source not in parts.samples or by not in offsets:
-        return nothing, nothing
-    if (source, camera) not in known:
-        frame = instant - offsets[by]
-        sample = parts.samples[source]
-        known[source, camera] = (sample.pixels(0, frame), sample.pixels(1, frame))
-    return known[source, camera]
+
+    @cache
+    def pixels(source: str, camera: str) -> tuple[Array, Array]:
+        by = (camera, source)[numbered]
+        if source not in parts.samples or by not in offsets:
+            return np.empty((0, 2)), np.empty((0, 2))
+        frame, sample = instant - offsets[by], parts.samples[source]
+        return sample.pixels(0, frame), sample.pixels(1, frame)
+
+    return pixels

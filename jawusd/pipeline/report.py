@@ -18,7 +18,7 @@ from jawusd.formats.experiments import Experiments, save_table
 from jawusd.formats.finding import Finding, FoundJson
 from jawusd.formats.model import JawModel, load_model
 from jawusd.formats.notes import SyncNotes
-from jawusd.formats.report import BuildVerdict, CameraFacts, Origin, Overlay, ReportData, RigFacts
+from jawusd.formats.report import BuildVerdict, CameraFacts, Origin, ReportData, RigFacts
 from jawusd.formats.tracks import Tracks, load_tracks
 from jawusd.pipeline.cameras import load_cameras
 from jawusd.pipeline.contact import contact_pictures
@@ -66,6 +66,16 @@ class BuildFacts:
     origin: Origin
     why_not: str = ""  # why the capture is not available
 
+    def given(self) -> Capture:
+        """Return the capture.
+
+        Raises:
+            FormatError: it is not available.
+        """
+        if self.capture is None:
+            raise FormatError(self.why_not)
+        return self.capture
+
 
 @explain_missing_packages()
 def write_build_report(
@@ -91,7 +101,10 @@ def write_build_report(
     unmet, unseen = list[str](), list[str]()
     # Decoding, drawing and measuring images releases the GIL.
     with ThreadPoolExecutor(1) as pool:
-        drawn = pool.submit(attempt, "images of the footage", unseen, lambda: _overlays(facts, tracks))
+        images = "images of the footage"
+        drawn = pool.submit(
+            attempt, images, unseen, lambda: draw_worst_frames(facts.given(), recorded_offsets(facts.state), tracks)
+        )
         contacts = attempt("contacts of the teeth", unmet, lambda: contact_pictures(model, subject)) or ()
         data = _without_pictures(folder, facts, tracks, model, subject, experiments)
         progress("report", 1, 4)
@@ -127,7 +140,7 @@ def _without_pictures(
         tracks=tracks,
         model=model,
         sync=facts.state.result("sync", SyncNotes) or {},
-        cameras=attempt("cameras", left_out, lambda: _cameras(facts)) or (),
+        cameras=attempt("cameras", left_out, lambda: camera_facts(facts.given())) or (),
         inferred=tuple(fit_summary(model).get("inferred", ())),
         seconds={name: record.seconds for name, record in facts.state.stages.items() if name != "report"},
         hashes=_hashes(facts.state.stages),
@@ -252,12 +265,6 @@ def attempt(what: str, left_out: list[str], work: Callable[[], T]) -> T | None:
         return None
 
 
-def _overlays(facts: BuildFacts, tracks: Tracks) -> tuple[Overlay, ...]:
-    if facts.capture is None:
-        raise FormatError(facts.why_not)
-    return draw_worst_frames(facts.capture, recorded_offsets(facts.state), tracks)
-
-
 def recorded_offsets(state: BuildState) -> dict[str, int]:
     """Return the frame offset of every camera recorded by a build; empty if the build did not synchronise them.
 
@@ -265,12 +272,6 @@ def recorded_offsets(state: BuildState) -> dict[str, int]:
         FormatError: build.json is corrupt.
     """
     return (state.result("sync", SyncNotes) or {}).get("offsets", {})
-
-
-def _cameras(facts: BuildFacts) -> tuple[CameraFacts, ...]:
-    if facts.capture is None:
-        raise FormatError(facts.why_not)
-    return camera_facts(facts.capture)
 
 
 def camera_facts(capture: Capture) -> tuple[CameraFacts, ...]:
