@@ -73,7 +73,7 @@ def test_shown_texts_use_the_words_of_the_glossary():
     assert [(file, *fault) for file, text in texts for fault in synonyms_in(text)] == []
     assert [(file, *fault) for file, text in texts for fault in misnamed(text, names)] == []
     labelled = {file for file, text in texts if all(word in text.lower() for word in ("d2", "laterotrusion"))}
-    assert {"pose_panel.py", "plots.py", "take_plots.py", "figures.py", "solve_page.py"} <= labelled
+    assert {"pose_panel.py", "plots.py", "figures.py", "solve_page.py"} <= labelled
 
 
 @pytest.mark.parametrize("text", ["d2 lateral [mm]", "lateral d2 over opening d1", "d3 opening", "incisor moved"])
