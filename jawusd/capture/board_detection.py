@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -20,7 +21,10 @@ from jawusd.media.video import Video
 
 Search = Callable[[NDArray[np.uint8]], Array | None]
 
-_TIMES, _FEW_MARKERS = 2, 4  # minimum number of images that show the same wrong board, and of markers in each of them
+_TIMES, _FEW_MARKERS = 2, 4  # minimum number of images that show the same board, and of markers in each of them
+_WIDTH_PX = 960  # image width for the search of an unknown board; sufficient for boards that fill a fifth of the image
+_FAMILIES = ("4X4", "5X5", "6X6", "7X7")
+_SIZES = (50, 100, 250, 1000)  # sizes of OpenCV's marker dictionaries; smaller ones are prefixes of larger ones
 _FEWEST_CORNERS = 8  # minimum number of corners of a ChArUco board; fewer do not determine its pose
 # Size of the corner refinement window as a fraction of a board cell. Blur and distortion bias corners in larger
 # windows; noise dominates in smaller ones.
@@ -45,13 +49,7 @@ def different_board(images: Sequence[NDArray[np.uint8]], boards: Boards, missed:
         missed: whether the board of [boards] was missed in most images of the clip; only then are absent markers
             evidence of a smaller board.
     """
-    plain: Counter[tuple[int, int]] = Counter()
-    for image in images:
-        flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_LARGER
-        ok, _, meta = cv2.findChessboardCornersSBWithMeta(image, (3, 3), flags=flags)
-        if ok:
-            plain[max(meta.shape), min(meta.shape)] += 1
-    (cols, rows), times = plain.most_common(1)[0] if plain else ((0, 0), 0)
+    (cols, rows), times = _common_chessboard(images)
     described = f"{boards.cols} x {boards.rows}"
     if boards.pattern == "chessboard":
         if times >= _TIMES and {cols, rows} != {boards.cols, boards.rows}:
@@ -70,6 +68,58 @@ def different_board(images: Sequence[NDArray[np.uint8]], boards: Boards, missed:
             f"the board has markers 0 to {max(highest)}, but a board of {described} inner corners has 0 to {count - 1}"
         )
     return None
+
+
+def _common_chessboard(images: Sequence[NDArray[np.uint8]]) -> tuple[tuple[int, int], int]:
+    """Return the numbers of inner corners, columns first, of the chessboard that most images show, and their number."""
+    flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_LARGER
+    found = [cv2.findChessboardCornersSBWithMeta(image, (3, 3), flags=flags) for image in images]
+    sizes = Counter((max(meta.shape), min(meta.shape)) for ok, _, meta in found if ok)
+    return sizes.most_common(1)[0] if sizes else ((0, 0), 0)
+
+
+@dataclass(frozen=True)
+class DetectedBoard:
+    """Calibration board found in clips: number of inner corners of a chessboard, or the marker dictionary."""
+
+    pattern: str
+    cols: int | None = None
+    rows: int | None = None
+    dictionary: str | None = None
+
+
+def detect_board(pictures: Iterable[NDArray[np.uint8]]) -> DetectedBoard | None:
+    """Return the board found in the largest number of gray images (h, w), or None if no two images agree."""
+    markers: Counter[str] = Counter()
+    highest: dict[str, int] = {}
+    small = [_reduced(picture) for picture in pictures]
+    for picture in small:
+        for family, largest in _markers(picture):
+            markers[family] += 1
+            highest[family] = max(largest, highest.get(family, 0))
+    family, times = markers.most_common(1)[0] if markers else ("", 0)
+    if times >= _TIMES:
+        size = next(size for size in _SIZES if size > highest[family])
+        return DetectedBoard("charuco", dictionary=f"DICT_{family}_{size}")
+    (cols, rows), times = _common_chessboard(small)
+    return DetectedBoard("chessboard", cols, rows) if times >= _TIMES else None
+
+
+def _reduced(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    height, width = picture.shape
+    if width <= _WIDTH_PX:
+        return np.ascontiguousarray(picture)
+    size = (_WIDTH_PX, round(height * _WIDTH_PX / width))
+    return np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def _markers(picture: NDArray[np.uint8]) -> Iterable[tuple[str, int]]:
+    """Yield each detected marker family and its highest marker number."""
+    for family in _FAMILIES:
+        dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{family}_{_SIZES[-1]}"))
+        numbers = cv2.aruco.ArucoDetector(dictionary).detectMarkers(picture)[1]
+        if numbers is not None and len(numbers) >= _FEW_MARKERS:
+            yield family, int(numbers.max())
 
 
 def corners_and_width(search: Search, image: NDArray[np.uint8], boards: Boards) -> tuple[Array, float]:

@@ -1,4 +1,4 @@
-"""Initial values of a calibration: the type of board in the clips, the intrinsics of each camera, the camera poses.
+"""Initial values of a calibration: the intrinsics of each camera, and the camera poses.
 
 A detector may list the corners of a symmetric board in a different order in every image. Each order corresponds to the
 board rotated in its plane. The relative pose of two fixed cameras is the same in all views only if the same corner is
@@ -8,8 +8,6 @@ that were not simultaneous.
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Iterable
 from dataclasses import dataclass
 
 import cv2
@@ -25,11 +23,6 @@ FEWEST_VIEWS = 6  # minimum number of board views per camera; with fewer, focal 
 _SAME_ANGLE_RAD, _SAME_SHARE = np.deg2rad(4.0), 0.04
 _LEAST_AGREEMENT = 0.5  # minimum fraction of two cameras' shared views that must agree on the relative pose
 _INTRINSIC_FLAGS = cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST
-_WIDTH_PX = 960  # image width for the board search; sufficient for boards that fill a fifth of the image
-_FEWEST_PICTURES = 2  # minimum number of images that must show the same board
-_FEWEST_MARKERS = 4
-_FAMILIES = ("4X4", "5X5", "6X6", "7X7")
-_SIZES = (50, 100, 250, 1000)  # sizes of OpenCV's marker dictionaries; smaller ones are prefixes of larger ones
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,52 +170,3 @@ def _relative_pose(name_a: str, name_b: str, T_cam_board: Array, turns: list[Arr
     near = strong[_equal(strong, flat[best])]
     gap = np.linalg.norm(near[:, None, :3] - near[None, :, :3], axis=(-1, -2)).sum(1)
     return near[int(np.argmin(gap))]
-
-
-@dataclass(frozen=True)
-class DetectedBoard:
-    """Calibration board found in clips: number of inner corners of a chessboard, or the marker dictionary."""
-
-    pattern: str
-    cols: int | None = None
-    rows: int | None = None
-    dictionary: str | None = None
-
-
-def detect_board(pictures: Iterable[NDArray[np.uint8]]) -> DetectedBoard | None:
-    """Return the board found in the largest number of gray images (h, w), or None if no two images agree."""
-    boards: Counter[tuple[int, int]] = Counter()
-    markers: Counter[str] = Counter()
-    highest: dict[str, int] = {}
-    for picture in pictures:
-        small = _reduced(picture)
-        for family, largest in _markers(small):
-            markers[family] += 1
-            highest[family] = max(largest, highest.get(family, 0))
-        flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_LARGER
-        ok, _, meta = cv2.findChessboardCornersSBWithMeta(small, (3, 3), flags=flags)
-        if ok:
-            boards[max(meta.shape), min(meta.shape)] += 1
-    family, times = markers.most_common(1)[0] if markers else ("", 0)
-    if times >= _FEWEST_PICTURES:
-        size = next(size for size in _SIZES if size > highest[family])
-        return DetectedBoard("charuco", dictionary=f"DICT_{family}_{size}")
-    (cols, rows), times = boards.most_common(1)[0] if boards else ((0, 0), 0)
-    return DetectedBoard("chessboard", cols, rows) if times >= _FEWEST_PICTURES else None
-
-
-def _reduced(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    height, width = picture.shape
-    if width <= _WIDTH_PX:
-        return np.ascontiguousarray(picture)
-    size = (_WIDTH_PX, round(height * _WIDTH_PX / width))
-    return np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), np.uint8)
-
-
-def _markers(picture: NDArray[np.uint8]) -> Iterable[tuple[str, int]]:
-    """Yield each detected marker family and its highest marker number."""
-    for family in _FAMILIES:
-        dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{family}_{_SIZES[-1]}"))
-        numbers = cv2.aruco.ArucoDetector(dictionary).detectMarkers(picture)[1]
-        if numbers is not None and len(numbers) >= _FEWEST_MARKERS:
-            yield family, int(numbers.max())

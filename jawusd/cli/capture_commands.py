@@ -108,13 +108,14 @@ def check(capture: CaptureArg, allow_outside: Outside = False, as_json: Json = F
     """
     from jawusd.base.errors import CaptureError
     from jawusd.cli.text_capture import check_lines
-    from jawusd.pipeline.check import check_capture, check_summary
+    from jawusd.pipeline.check import check_capture
 
     with progress() as report:
         findings = check_capture(capture, allow_outside=allow_outside, progress=report)
-    summary = check_summary(str(capture), findings)
-    emit(summary, as_json, lambda: check_lines(findings))
-    if summary["errors"]:
+    errors, warnings = (sum(found.severity == kind for found in findings) for kind in ("error", "warning"))
+    listed = {"capture": str(capture), "findings": [finding.as_json() for finding in findings]}
+    emit({**listed, "errors": errors, "warnings": warnings}, as_json, lambda: check_lines(findings))
+    if errors:
         raise typer.Exit(CaptureError.exit_code)
 
 

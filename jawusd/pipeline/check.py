@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TypedDict
 
 from jawusd.base.errors import CaptureError, JawusdError
 from jawusd.formats.capture import Capture, read_capture
@@ -22,15 +21,6 @@ _NEEDED = ("av", "cv2", "numba", "scipy", "torch", "onnx", "shapely", "trimesh",
 _FOR_REPORT = ("matplotlib", "jinja2")
 # Typical disk space of rig, tracks and report, and minimum free space to start a build [MB].
 _RIG_MB, _LEAST_MB = 200.0, 20.0
-
-
-class CheckSummary(TypedDict):
-    """Result of a check; its findings are in the form of `Finding.as_json`."""
-
-    capture: str
-    findings: list[dict[str, str | float | int]]
-    errors: int
-    warnings: int
 
 
 @dataclass(frozen=True)
@@ -164,13 +154,3 @@ def refuse_errors(findings: Sequence[Finding], capture: Capture) -> None:
         raise CaptureError(only.message, path=only.path or path, camera=only.camera, frame=only.frame, hint=only.hint)
     listed = "".join(f"\n  {finding.line()}" for finding in errors)
     raise CaptureError(f"the check found {len(errors)} errors:{listed}", path=path)
-
-
-def check_summary(name: str, findings: Sequence[Finding]) -> CheckSummary:
-    """Return findings as plain data, with the numbers of errors and warnings."""
-    return {
-        "capture": name,
-        "findings": [finding.as_json() for finding in findings],
-        "errors": sum(finding.severity == "error" for finding in findings),
-        "warnings": sum(finding.severity == "warning" for finding in findings),
-    }

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 from itertools import combinations
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -105,10 +105,10 @@ class Parts:
         self.open_files.close()
 
 
-def found_error(kind: str, error: JawusdError, severity: Literal["error", "warning"] = "error") -> Finding:
+def found_error(kind: str, error: JawusdError) -> Finding:
     """Convert an exception to a finding."""
     return Finding(
-        kind, severity, error.message, path=error.path, camera=error.camera, frame=error.frame, hint=error.hint
+        kind, "error", error.message, path=error.path, camera=error.camera, frame=error.frame, hint=error.hint
     )
 
 

@@ -63,34 +63,36 @@ def report_solve(
                 "contains tracks that do not come from a solve.",
                 hint="Give the .npz that `jawusd solve` wrote, or the folder of a build.",
             )
-        if capture is None:
-            _write(page, found, None, {}, tracks.stem, progress)
-        else:
+        shot, offsets = None, {}
+        if capture is not None:
             shot = open_capture(capture, allow_outside=allow_outside)
             check_same_cameras(shot, found)
-            write_solve_report(page, found, shot, sync_cameras(shot, progress)["offsets"], progress)
+            offsets = sync_cameras(shot, progress)["offsets"]
+        write_solve_report(page, found, shot, offsets, progress, tracks.stem)
     return page
 
 
+@explain_missing_packages()
 def write_solve_report(
-    page: str | os.PathLike[str], tracks: Tracks, capture: Capture, offsets: Mapping[str, int], progress: Progress
+    page: str | os.PathLike[str],
+    tracks: Tracks,
+    capture: Capture | None,
+    offsets: Mapping[str, int],
+    progress: Progress,
+    name: str = "",
 ) -> None:
     """Write the report of a solve, given its tracks and cameras.
 
     Args:
+        capture: the shot; None: the report has no images and no cameras.
         offsets: frame offset by camera.
+        name: name of a shot without a capture.
 
     Raises:
+        FormatError: there is no capture, and the tracks contain no frame rate.
         MissingDependencyError: matplotlib or jinja2 is not installed.
         OutputError: the page cannot be written.
     """
-    _write(Path(page), tracks, capture, offsets, capture.name, progress)
-
-
-@explain_missing_packages()
-def _write(
-    page: Path, tracks: Tracks, capture: Capture | None, offsets: Mapping[str, int], name: str, progress: Progress
-) -> None:
     from jawusd.report.solve_page import write_solve_page
 
     progress("report", 0, 2)
@@ -106,7 +108,7 @@ def _write(
         overlays = attempt("pictures", left_out, lambda: draw_frames(shot, offsets, tracks, chosen))
     progress("report", 1, 2)
     data = SolveReportData(
-        shot=name,
+        shot=name if capture is None else capture.name,
         tracks=tracks,
         fps=_rate(tracks) if capture is None else capture.fps,
         limits=solve_limits(tracks.camera_names),
@@ -115,7 +117,7 @@ def _write(
         versions=package_versions(),
         left_out=tuple(left_out),
     )
-    make_folder(page.resolve().parent)
+    make_folder(Path(page).resolve().parent)
     write_solve_page(page, data)
     progress("report", 2, 2)
 

@@ -199,7 +199,7 @@ def _named_as_calibrated(
 def _board(
     folder: Path, cameras: Sequence[CameraSketch], square_mm: float | None, calibrated: bool, out: CaptureStart
 ) -> BoardSketch | None:
-    from jawusd.capture.initial_guess import DetectedBoard, detect_board
+    from jawusd.capture.board_detection import DetectedBoard, detect_board
 
     clips = [camera.board for camera in cameras if camera.board is not None]
     if not clips:

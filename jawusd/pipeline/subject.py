@@ -149,16 +149,14 @@ def load_labelled(capture: Capture) -> tuple[dict[str, Mesh], list[Finding]]:
     """Return the meshes of `load_meshes`, and findings on the labels of the teeth scans."""
     paths = {name: getattr(capture.scans, name) for name in MESHES}
     files = {name: path for name, path in paths.items() if path is not None}
+    return _read_labelled(files, capture.scans.labels)
+
+
+def _read_labelled(files: Mapping[str, Path], labels: Path | None) -> tuple[dict[str, Mesh], list[Finding]]:
     meshes = read_files(files)
-    teeth = label_teeth(meshes, files, capture.scans.labels)
+    teeth = label_teeth(meshes, files, labels)
     labelled = {TEETH[arch]: scan.mesh for arch, scan in teeth.items()}
     return meshes | labelled, [finding for scan in teeth.values() for finding in scan.findings]
-
-
-def read_meshes(files: Mapping[str, Path]) -> dict[str, Mesh]:
-    """Read mesh files by the names in `MESHES`; raises like `load_meshes`."""
-    meshes = read_files(files)
-    return meshes | {TEETH[arch]: scan.mesh for arch, scan in label_teeth(meshes, files, None).items()}
 
 
 @explain_missing_packages()
@@ -267,7 +265,7 @@ def subject_of_scans(files: Mapping[str, Path], name: str) -> Subject:
     Raises:
         CaptureError: a mesh is corrupt or not in mm, or the scans are swapped or not in occlusion.
     """
-    return _measured(name, read_meshes(files), None, None, {})
+    return _measured(name, _read_labelled(files, None)[0], None, None, {})
 
 
 def _measured(
