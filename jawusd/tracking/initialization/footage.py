@@ -18,6 +18,8 @@ from jawusd.media.working_view import WorkingView
 from jawusd.tracking.contour.views import FEWEST_CAMERAS, MaskViews
 
 _BESIDE = 2  # number of surveyed frames on either side of a chosen frame to skip as redundant
+# Maximum ratio of the area of a plausible mask to that of masks known to be correct: an opening mouth shows more teeth.
+_MOST_AREA = 5.0
 _WIDTH_PX = 320  # width of the surveyed mask images [px]: enough for mask centres accurate to 0.1 mm
 
 
@@ -74,15 +76,22 @@ class MaskSurvey:
                 out[f, r] = triangulate(self.matrices[seen], self.middles[f, r, seen])
         return out
 
-    def promising(self, count: int) -> NDArray[np.int64]:
+    def promising(self, count: int, usual_px: Array | None = None) -> NDArray[np.int64]:
         """Return at most `count` frames with large masks of both arches in all cameras, the best first.
 
         Areas are clipped at their 90 % quantile, since larger masks may be wrong. Neighbouring frames are redundant, so
         they come after all others.
+
+        Args:
+            count: maximum number of frames.
+            usual_px: areas of correct masks [px], shape (2, C); far larger masks count as missing.
         """
-        full = np.maximum(np.quantile(self.areas_px, 0.9, axis=0), 1.0)
-        shown = np.sqrt(np.minimum(self.areas_px / full, 1.0)).sum(-1).min(-1)
-        usable = ((self.areas_px > 0).sum(-1) >= self.fewest).all(-1)
+        areas_px = self.areas_px
+        if usual_px is not None:
+            areas_px = np.where(areas_px > _MOST_AREA * usual_px, 0.0, areas_px)
+        full = np.maximum(np.quantile(areas_px, 0.9, axis=0), 1.0)
+        shown = np.sqrt(np.minimum(areas_px / full, 1.0)).sum(-1).min(-1)
+        usable = ((areas_px > 0).sum(-1) >= self.fewest).all(-1)
         apart: list[int] = []
         beside: list[int] = []
         for f in np.argsort(-shown, kind="stable").tolist():

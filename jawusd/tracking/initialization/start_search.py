@@ -40,9 +40,15 @@ _NEAR_GRID = Grid(
     roll_rad=np.radians(np.arange(-20, 21, 10.0)),
     reach_mm=(6.0, 6.0, 6.0),
 )
-# Jaw openings [mm] for placing one arch relative to the other, and height and depth [mm] of the hinge axis relative to
-# the front teeth. A single arch also fits when shifted along itself by one tooth, but jaws do not move that way.
-_OPENINGS_MM, _CONDYLES_MM = (0.0, 6.0, 14.0, 24.0, 36.0), (40.0, -90.0)
+# Height and depth [mm] of the hinge axis relative to the front teeth, and jaw openings for placing one arch relative to
+# the other: downward motion of the front teeth, upward and forward motion of the condyles [mm]. Some jaws open by pure
+# rotation at first; the condyles of others slide forward from the first millimetre. A single arch also fits when
+# shifted along itself by one tooth, but jaws do not move that way.
+_CONDYLES_MM = (40.0, -90.0)
+_OPENINGS_MM = (
+    *((opening, 0.0, 0.0) for opening in (0.0, 6.0, 14.0, 24.0, 36.0)),
+    *((14.0, -3.0, 4.0), (24.0, -6.0, 8.0), (36.0, -7.0, 11.5), (48.0, -8.0, 14.0)),
+)
 _WIDEST_JAW_RAD = 0.8  # maximum rotation between the arches [rad]
 _FARTHEST_JAW_MM = 75.0  # maximum distance between the front teeth of the arches [mm]
 
@@ -203,7 +209,7 @@ class StartSearch:
 
 
 def _opened(crowns: Array, T_anatomical_scan: Array) -> list[Array]:
-    """Return T_upper_lower of a closed jaw and of pure hinge openings, shape (4, 4) each.
+    """Return T_upper_lower of a closed and of opened jaws, shape (4, 4) each.
 
     Args:
         crowns: crown vertices of the lower teeth, scan coordinates [mm], shape (N, 3).
@@ -213,9 +219,9 @@ def _opened(crowns: Array, T_anatomical_scan: Array) -> list[Array]:
     up, front = _CONDYLES_MM
     hinge = points[points[:, 2].argmax()] * [0.0, 1.0, 1.0] + [0.0, up, front]
     out = []
-    for opening in _OPENINGS_MM:
-        turn = so3_exp(np.array([opening / np.hypot(up, front), 0.0, 0.0]))
-        moved = make_transform(turn, hinge - turn @ hinge)
+    for opening, slid_up, slid_front in _OPENINGS_MM:
+        turn = so3_exp(np.array([(opening + slid_up) / np.hypot(up, front), 0.0, 0.0]))
+        moved = make_transform(turn, hinge - turn @ hinge + [0.0, slid_up, slid_front])
         out.append(se3_inverse(T_anatomical_scan) @ moved @ T_anatomical_scan)
     return out
 

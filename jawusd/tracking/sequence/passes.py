@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Container, Iterator, Mapping, MutableMapping, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
 from jawusd.base.arrays import Array
+from jawusd.base.errors import TrackingError
 from jawusd.formats.tracks import LOST, RECOVERED, TRACKED, LostReason
 from jawusd.geometry import relative_pose, transform_points
 from jawusd.tracking.config import TrackingConfig
@@ -20,6 +22,7 @@ from jawusd.tracking.follow import Begin, TwoWays, both_ways
 from jawusd.tracking.initialization.first_frame import first_record
 from jawusd.tracking.sequence.frame_tracker import FrameTracker
 from jawusd.tracking.sequence.history import History, MotionPredictor, SearchBudget
+from jawusd.tracking.sequence.lost_search import LostSearch
 
 Progress = Callable[[int, int], None]
 
@@ -50,13 +53,16 @@ class Passes:
         self.records = PackedRecords()
         self.searches = SearchBudget(stop - first)
 
-    def track_from(self, frame: int, poses: Array) -> None:
+    def track_from(self, frame: int, poses: Array, search: LostSearch) -> None:
         """Track from the given frame in both directions, and back from frames by which others can be judged.
+
+        Where the teeth stay lost although there are masks, they are searched for.
 
         Args:
             frame: reference frame number.
             poses: T_world_scan of both arches in that frame, close enough for the alignment to converge, shape (2, 4,
                 4).
+            search: finds the teeth where they were lost.
 
         Raises:
             TrackingError: the teeth do not fit the masks of that frame.
@@ -73,6 +79,37 @@ class Passes:
         )
         take.follow(Begin(frame, self.begin(frame, poses), self._walk))
         self.judge_first(take, frame)
+        take.recover(partial(self._found_in, search, SearchBudget(len(take.frames))))
+
+    def _found_in(self, search: LostSearch, budget: SearchBudget, lost: range, near: FrameRecord) -> Begin[FrameRecord]:
+        """Search for the teeth in a lost stretch, where they must fit as well as in other frames.
+
+        Raises:
+            TrackingError: the teeth were not found.
+            CaptureError: a mask cannot be read.
+        """
+        for frame in search.frames(lost, self.records):
+            if budget.allows(frame):
+                record = self._searched(search, lost, frame, near.solution.poses)
+                budget.note(frame, record is not None)
+                if record is not None:
+                    return Begin(frame, record, self._walk)
+        raise TrackingError("the teeth were not found where they were lost")
+
+    def _searched(self, search: LostSearch, lost: range, frame: int, near: Array) -> FrameRecord | None:
+        """Return the record of a lost frame after a search near given poses (2, 4, 4), or None if it stays lost."""
+        before = self.records[frame]
+        poses = near.copy()
+        if before.found[0]:
+            poses = before.solution.poses[0] @ np.stack([np.eye(4), relative_pose(*near)])
+        if before.found[1]:
+            poses = before.solution.poses[1] @ np.stack([relative_pose(*near[::-1]), np.eye(4)])
+        found = search.at(frame, poses, everywhere=not before.found.any())
+        if found is None:
+            return None
+        record = self.tracker_beside(frame, lost).track([found], self._masks.at(frame), None)
+        status = np.where(before.found, record.status, RECOVERED).astype(np.int8)
+        return replace(record, status=status) if record.found.all() else None
 
     def begin(self, frame: int, poses: Array) -> FrameRecord:
         """Align the first frame."""

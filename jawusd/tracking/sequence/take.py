@@ -20,12 +20,15 @@ from jawusd.tracking.contour.annotator import drawn_prior
 from jawusd.tracking.contour.frame_record import FrameRecord, PackedRecords, whole_frames
 from jawusd.tracking.contour.scan import prepare_scan, teeth_centre
 from jawusd.tracking.contour.solver import ContourSolver
-from jawusd.tracking.contour.views import MaskViews, View, present_masks
+from jawusd.tracking.contour.views import MaskViews, View, masked_sources, present_masks
+from jawusd.tracking.initialization.footage import Footage
 from jawusd.tracking.initialization.magnification import measure_magnification
 from jawusd.tracking.initialization.start import find_start, quote_findings
+from jawusd.tracking.initialization.start_search import StartSearch
 from jawusd.tracking.sequence.closed_bite import RestFrames, observe_bite, rest_frames
 from jawusd.tracking.sequence.delays import BRIDGE_FRAMES, bridge, delay_motions
 from jawusd.tracking.sequence.extrinsics import Extrinsics
+from jawusd.tracking.sequence.lost_search import LostSearch
 from jawusd.tracking.sequence.nuisance import Nuisances, TakeEquations
 from jawusd.tracking.sequence.passes import Passes, Progress, mark_poorly_seen_lost
 from jawusd.tracking.sequence.results import assemble, outline_variance
@@ -82,8 +85,10 @@ def track_capture(
         with MaskViews(capture.cameras, table, offsets, centre, config.working_px_per_mm) as masks:
             first, stop = capture.frames or masks.frames
             take = _Take(solver, config, masks, first, stop, progress)
+            footage = Footage(masked_sources(capture.cameras, table, offsets), table, offsets, capture.frames)
+            lost = LostSearch(lambda: StartSearch((upper, lower), solver, start.T_anatomical_scan, pool.map), footage)
             with quote_findings(start.findings):
-                take.track_from(start.frame, start.poses)
+                take.track_from(start.frame, start.poses, lost)
             point = np.mean([scan.centre for scan in scans], axis=0)
             named, up = capture.motion.rest_frame, start.T_anatomical_scan[1, :3]
             frames = rest_frames(take.records, named, up, point, scans[1].probes)
