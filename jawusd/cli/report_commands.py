@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -169,12 +170,9 @@ def view(
 ) -> None:
     """View and animate a rig in the browser; or view the footage of a capture, to inspect poses and set picks."""
     from jawusd.pipeline.state import changed_files
-    from jawusd.pipeline.view import open_viewer
-    from jawusd.pipeline.view_capture import is_capture, open_capture_viewer
-    from jawusd.rig.layout import EXAMPLE_RIG
+    from jawusd.pipeline.view import is_capture
 
-    rig = EXAMPLE_RIG if rig is None else rig
-    capture = is_capture(rig)
+    capture = rig is not None and is_capture(rig)
     if tracks is not None and not capture:
         raise typer.BadParameter("--tracks needs a capture, not a rig.")
     if prim is not None and capture:
@@ -188,34 +186,62 @@ def view(
     for folder in (rig, tracks):
         for found in changed_files(folder) if folder is not None and folder.is_dir() else ():
             say(found.line(), err=True)
-    viewer: PageServer
-    if capture:
-        with progress() as report:
-            viewer = open_capture_viewer(rig, tracks, host, port, report, allow_outside=allow_outside)
+    if rig is not None and capture:
+        _serve_capture(rig, tracks, host, port, browser, allow_outside)
     else:
+        _serve_rig(rig, host, port, prim, browser, play)
+
+
+def _serve_capture(
+    capture: Path, tracks: Path | None, host: str, port: int, browser: bool, allow_outside: bool
+) -> None:
+    """Serve the page of a capture."""
+    from jawusd.pipeline.view_capture import open_capture_viewer
+
+    with progress() as report:
+        viewer = open_capture_viewer(capture, tracks, host, port, report, allow_outside=allow_outside)
+    _announce(browser, viewer.url)
+    _serve(viewer)
+
+
+def _serve_rig(rig: Path | None, host: str, port: int, prim: str | None, browser: bool, play: bool) -> None:
+    """Serve the page of a rig, or of the example rig, which is valid, so that a browser can start before it is read."""
+    from jawusd.pipeline.view import open_viewer
+
+    if rig is not None:
         viewer = open_viewer(rig, host, port, prim, play=play)
-    _serve(viewer, browser)
+        _announce(browser, viewer.url)
+    else:
+        try:
+            viewer = open_viewer(None, host, port, prim, play=play, opened=partial(_announce, browser))
+        except KeyboardInterrupt:  # also stops a page that is not complete
+            return
+    _serve(viewer)
 
 
-def _serve(viewer: PageServer, browser: bool) -> None:
-    """Serve a page until Ctrl+C; open it in a browser first if `browser` is true."""
+def _announce(browser: bool, url: str) -> None:
+    """Print the address of a page; open it in a browser if `browser` is true."""
     import webbrowser
 
+    say(f"{url}  (Ctrl+C stops)")
+    if browser:
+        webbrowser.open(url)
+
+
+def _serve(viewer: PageServer) -> None:
+    """Serve a page until Ctrl+C."""
     try:
-        say(f"{viewer.url}  (Ctrl+C stops)")
-        if browser:
-            webbrowser.open(viewer.url)
         viewer.wait()
     except KeyboardInterrupt:
         viewer.stop()
 
 
-def _write_page(rig: Path, page: Path, force: bool, prim: str | None, footage: bool) -> None:
+def _write_page(rig: Path | None, page: Path, force: bool, prim: str | None, footage: bool) -> None:
     """Write the web page of a rig that needs no server."""
     from jawusd.pipeline.pose_page import write_page
-    from jawusd.pipeline.view_capture import is_capture
+    from jawusd.pipeline.view import is_capture
 
-    if is_capture(rig):
+    if rig is not None and is_capture(rig):
         raise typer.BadParameter("--page needs a rig, not a capture.")
     refuse_existing(page, force)
     write_page(rig, page, prim, footage=footage)

@@ -17,6 +17,8 @@ from jawusd.formats.text import parse_model
 
 #: Maximum number of frames, all of which are baked (an hour at 60 frames per second), and maximum frame number.
 MOST_FRAMES, FARTHEST_FRAME = 220_000, 1e9
+#: Frame rate of motions whose rate is not known [1/s].
+DEFAULT_FPS = 24.0
 _MAX_BYTES = 64 << 20
 #: Maximum magnitude of a jaw parameter [mm]; larger values overflow when they are projected into the bound.
 FARTHEST_MM = 1e6

@@ -12,6 +12,7 @@ from jawusd.evaluator import JawRig
 from jawusd.evaluator.skin import Skin
 from jawusd.formats.arkit import JAW_COLUMNS, shares_of
 from jawusd.formats.capture import Capture
+from jawusd.formats.keys import DEFAULT_FPS
 from jawusd.formats.model import JawModel
 from jawusd.formats.poses import JointDelta
 from jawusd.formats.tracks import Tracks
@@ -21,7 +22,6 @@ from jawusd.pipeline.contact import condyle_solids, tooth_solids, with_condyle_c
 from jawusd.pipeline.state import Progress, no_progress
 from jawusd.pipeline.subject import BONES, Subject, registered_subject
 
-DEFAULT_FPS = 24.0
 _PROXY_FACES = 1500  # number of faces of a proxy mesh, not counting those along borders; see `proxy_of`
 _TEETH_APART_MM = 15.0  # maximum distance between the (picked or detected) tooth landmarks of model and scans
 

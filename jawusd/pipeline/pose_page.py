@@ -22,7 +22,9 @@ _TILE_PX, _MOST_IMAGES, _QUALITY = (320, 240), 150, 50
 
 
 @explain_missing_packages()
-def write_page(path: str | os.PathLike[str], out: Path, prim: str | None = None, *, footage: bool = False) -> None:
+def write_page(
+    path: str | os.PathLike[str] | None, out: Path, prim: str | None = None, *, footage: bool = False
+) -> None:
     """Write a page that poses the rig at a path; other arguments and further errors are those of `viewed_actor`.
 
     Args:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+from collections.abc import Callable
 from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -15,20 +16,21 @@ from jawusd.base.arrays import Array, Mask
 from jawusd.base.errors import FormatError, OutputError, RigError, explain_missing_packages
 from jawusd.evaluator import JawRig
 from jawusd.formats.atomic import refuse_existing
+from jawusd.formats.keys import DEFAULT_FPS
 from jawusd.formats.mesh import Mesh
-from jawusd.formats.tracks import load_tracks
-from jawusd.pipeline.bake import DEFAULT_FPS
-from jawusd.pipeline.contact import teeth_of
 from jawusd.pipeline.state import recorded_verdict
 
 if TYPE_CHECKING:
     from jawusd.meshes.contact import ContactMap, Teeth
     from jawusd.viewer.motion import Clip
     from jawusd.viewer.server import Viewer
-    from jawusd.viewer.viewed import ViewedActor
+    from jawusd.viewer.viewed import ViewedActor, ViewedFootage
 
 #: Name under which the captured motion is listed among an actor's motions.
 CAPTURED = "captured take"
+
+#: Name of the file that describes a capture.
+CAPTURE_FILE = "capture.toml"
 
 _TRACKS, _BAKED = "tracks.npz", "anim_capture.usdc"
 _ANIMATION = re.compile(r"anim[A-Za-z0-9_-]{0,100}\.usd[ac]?")
@@ -37,12 +39,19 @@ _MOST_FACES = 8_000  # maximum number of faces of a mesh; browsers without a GPU
 
 @explain_missing_packages()
 def open_viewer(
-    path: str | os.PathLike[str], host: str, port: int, prim: str | None = None, *, play: bool = True
+    path: str | os.PathLike[str] | None,
+    host: str,
+    port: int,
+    prim: str | None = None,
+    *,
+    play: bool = True,
+    opened: Callable[[str], None] | None = None,
 ) -> Viewer:
     """Serve the rig at a path to browsers; for further errors, see `viewed_actor`.
 
     Args:
         play: whether pages play the captured take, if there is one, when they are opened.
+        opened: called with the address once it can be opened, before the rig is read.
 
     Raises:
         MissingDependencyError: the viewer is not installed.
@@ -50,21 +59,21 @@ def open_viewer(
     """
     from jawusd.viewer.server import Viewer
 
-    return Viewer(viewed_actor(path, prim), host, port, play=play)
+    return Viewer(partial(viewed_actor, path, prim), host, port, play=play, opened=opened)
 
 
-def viewed_actor(path: str | os.PathLike[str], prim: str | None = None) -> ViewedActor:
+def viewed_actor(path: str | os.PathLike[str] | None, prim: str | None = None) -> ViewedActor:
     """Load a rig for the viewer.
 
     Args:
-        path: `actor.usda`, another layer or package that contains the rig, or the folder of a build.
+        path: `actor.usda`, another layer or package that contains the rig, or the folder of a build; None: the example
+            rig that ships with jawusd.
         prim: path of the rig's prim, if a stage has several; motions are then layers over the stage.
 
     Raises:
         FormatError: the file is not a rig, or the rig has no geometry.
         RigError: the file is not USD.
     """
-    from jawusd.pipeline.view_footage import take_footage
     from jawusd.rig.geo import read_geometry
     from jawusd.rig.read import describe, load_rig
     from jawusd.viewer.viewed import ViewedActor
@@ -85,12 +94,30 @@ def viewed_actor(path: str | os.PathLike[str], prim: str | None = None) -> Viewe
         save_layer=partial(save_motion, path, rig, prim=prim),
         contacts=None if rig.contact is None else ContactView(path, rig, place).draw,
         verdict=recorded_verdict(path.parent) or "",
-        footage=take_footage(path.parent),
+        footage=_footage(path.parent),
     )
 
 
-def rig_file(path: str | os.PathLike[str]) -> Path:
-    """Return the file of a rig, given that file or the folder of a build."""
+def _footage(folder: Path) -> ViewedFootage | None:
+    """Return the footage of a captured take; packages that read captures are loaded only for folders with tracks."""
+    if not (folder / _TRACKS).is_file():
+        return None
+    from jawusd.pipeline.view_footage import take_footage
+
+    return take_footage(folder)
+
+
+def is_capture(path: Path) -> bool:
+    """Return whether a path is a capture, not a rig."""
+    return path.suffix == ".toml" or (path / CAPTURE_FILE).is_file()
+
+
+def rig_file(path: str | os.PathLike[str] | None) -> Path:
+    """Return the file of a rig, given that file or the folder of a build; None: the example rig."""
+    if path is None:
+        from jawusd.rig.layout import EXAMPLE_RIG
+
+        return EXAMPLE_RIG
     path = Path(path)
     return path / "actor.usda" if path.is_dir() else path
 
@@ -113,6 +140,7 @@ class ContactView:
         Raises:
             RigError: tooth contact cannot be computed from the rig's meshes.
         """
+        from jawusd.pipeline.contact import teeth_of
         from jawusd.rig.geo import read_geometry
 
         return teeth_of(self._rig, read_geometry(self._path, self._prim))
@@ -176,6 +204,7 @@ def load_motion(folder: Path, rig: JawRig, fps: float, name: str, *, prim: str |
         FormatError: there is no such motion, or it cannot be read.
         RigError: the file is not USD.
     """
+    from jawusd.formats.tracks import load_tracks
     from jawusd.rig.motion_read import read_poses_of_stage
     from jawusd.rig.read import describe
     from jawusd.viewer.motion import Clip

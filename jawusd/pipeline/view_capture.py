@@ -25,24 +25,19 @@ from jawusd.pipeline.report import as_built, is_build, recorded_offsets
 from jawusd.pipeline.scans import save_reviewed
 from jawusd.pipeline.state import BuildState, Progress
 from jawusd.pipeline.subject import load_meshes, registered_meshes, subject_of_capture
+from jawusd.pipeline.view import CAPTURE_FILE
 from jawusd.pipeline.workspace import open_capture
 
 if TYPE_CHECKING:
     from jawusd.media.overlay import Backdrop, PlacedScan
     from jawusd.media.side_by_side import CameraWall
-    from jawusd.viewer.server import CaptureViewer
+    from jawusd.viewer.capture_page import CaptureViewer
     from jawusd.viewer.viewed import Look, ViewedCapture
 
-CAPTURE_FILE = "capture.toml"
 _TRACKS = "tracks.npz"
 _SPECKS_PERCENT = 0.5
 _TILE_PX = (480, 360)  # maximum size of a camera's tile; three tiles fill the width of the page
 _FILL: dict[Look, float] = {"outlines": 0.0, "tinted": 0.3}
-
-
-def is_capture(path: Path) -> bool:
-    """Return whether a path is a capture, not a rig."""
-    return path.suffix == ".toml" or (path / CAPTURE_FILE).is_file()
 
 
 @explain_missing_packages()
@@ -60,7 +55,7 @@ def open_capture_viewer(
     Raises:
         MissingDependencyError: the viewer is not installed.
     """
-    from jawusd.viewer.server import CaptureViewer
+    from jawusd.viewer.capture_page import CaptureViewer
 
     return CaptureViewer(viewed_capture(path, tracks, progress, allow_outside=allow_outside), host, port)
 

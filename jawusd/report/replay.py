@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from jawusd.base.arrays import Array
 from jawusd.evaluator import JawRig
 from jawusd.evaluator.motions import motions_of_poses
+from jawusd.formats.keys import DEFAULT_FPS
 from jawusd.formats.report import ReplayPart, ReportData
 from jawusd.formats.tracks import LOST, PARTIAL, RECOVERED, Tracks
 from jawusd.geometry import transform_points
@@ -19,7 +20,6 @@ STATES = ("tracked", "recovered after a loss", "tracked without a camera", "lost
 #: Landmarks whose paths are drawn: the lower incisal point and both condyles.
 TRACED = (0, 3, 4)
 _MOST_FRAMES = 6000  # maximum number of frames; longer takes are subsampled
-_DEFAULT_FPS = 24.0
 
 
 def replay_data(data: ReportData) -> dict[str, object] | None:
@@ -53,7 +53,7 @@ def replay_data(data: ReportData) -> dict[str, object] | None:
         "frames": encoded(tracks.frames[rows].astype("<i4")),
         "state": encoded(_states(tracks)[rows]),
         "states": list(STATES),
-        "fps": float(data.model.notes.get("fps") or _DEFAULT_FPS) / step,
+        "fps": float(data.model.notes.get("fps") or DEFAULT_FPS) / step,
         "centre": (0.5 * (low + high)).round(2).tolist(),
         "radius": round(float(np.linalg.norm(high - low)) / 2, 2),
         "traced": landmarks[list(TRACED)].round(3).tolist(),

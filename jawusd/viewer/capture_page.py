@@ -1,4 +1,4 @@
-"""The page of a capture; every visitor has a separate view and separate picks."""
+"""The page of a capture and its server; every visitor has a separate view and separate picks."""
 
 from __future__ import annotations
 
@@ -15,10 +15,11 @@ from jawusd.formats.capture import Bootstrap
 from jawusd.geometry import make_transform, transform_points
 from jawusd.geometry.se3 import se3_inverse
 from jawusd.viewer.capture_panels import ALL, FootagePanel, PicksPanel
-from jawusd.viewer.capture_scene import UP, CaptureScene
+from jawusd.viewer.capture_scene import UP, CaptureScene, set_first_view
 from jawusd.viewer.picking import ARCHES, PickingLayout, fit_view, hit_vertex, region_around
 from jawusd.viewer.scan_labels import BRUSHES, ScanLabelsPanel
 from jawusd.viewer.scene import PHONE
+from jawusd.viewer.server import PageServer
 from jawusd.viewer.viewed import Region, ViewedCapture
 from jawusd.viewer.widgets import begin_panel, errors_shown, guarded, limit_uploads
 
@@ -267,3 +268,16 @@ class CapturePage:
         self.footage.player.close()
         if self._drawing is not None:
             self._drawing.cancel()
+
+
+class CaptureViewer(PageServer):
+    """Server of a capture."""
+
+    def __init__(self, capture: ViewedCapture, host: str, port: int) -> None:
+        """Start serving a capture; see `PageServer`."""
+        self._capture = capture
+        super().__init__(capture.name, host, port)
+        set_first_view(self._server)
+
+    async def _page(self, client: viser.ClientHandle) -> CapturePage:
+        return CapturePage(client, self._capture)

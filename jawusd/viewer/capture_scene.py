@@ -44,7 +44,6 @@ class CaptureScene:
         """Draw everything that does not depend on the image."""
         self._client, self._scene, self._capture = client, client.scene, capture
         scene = self._scene
-        add_lights(scene, UP)
         self.T_page_world = next((camera.T_cam_world for camera in capture.cameras.values()), np.eye(4))
         self._layout = scene.add_frame("/layout", show_axes=False)
         self._picture: viser.ImageHandle | None = None
@@ -183,7 +182,8 @@ class CaptureScene:
 
 
 def set_first_view(server: viser.ViserServer) -> None:
-    """Set the initial virtual camera of every page: upright, in front of the image."""
+    """Light every page, and set its initial virtual camera: upright, in front of the image."""
+    add_lights(server.scene, UP)
     server.scene.set_up_direction("-y")
     first = server.initial_camera
     first.position, first.look_at, first.up = (0.0, 0.0, -_FIRST_EYE_MM), (0.0, 0.0, 0.0), UP

@@ -16,7 +16,7 @@ from jawusd.viewer.motion_panel import FilePanel, MotionPanel, Playback
 from jawusd.viewer.plots import VERMILION, bound_plot, posselt_plot, posselt_point
 from jawusd.viewer.pose_panel import ContactPanel, PosePanel, verdict_html
 from jawusd.viewer.readouts import landmark_places, rest_places
-from jawusd.viewer.scene import FIRST_VIEW, JawScene
+from jawusd.viewer.scene import FIRST_VIEW, JawScene, set_lens
 from jawusd.viewer.session import Session
 from jawusd.viewer.viewed import ViewedActor
 from jawusd.viewer.widgets import begin_panel, guarded, small_text
@@ -74,6 +74,7 @@ class PlotPanel:
 def begin_page(client: viser.ClientHandle, actor: ViewedActor) -> JawScene:
     """Draw the jaw; the panels are added later."""
     begin_panel(client, actor.name)
+    set_lens(client.camera)
     scene = JawScene(client, actor)
     scene.look(FIRST_VIEW)
     return scene
@@ -83,8 +84,9 @@ class Page:
     """Connect a page's widgets with its session."""
 
     def __init__(self, client: viser.ClientHandle, scene: JawScene, actor: ViewedActor, static: StaticPlots) -> None:
-        """Add the panels beside the jaw drawn by `begin_page`."""
+        """Add the panels beside the jaw drawn by `begin_page`, and the marks on it."""
         self.client, self.scene = client, scene
+        scene.add_marks(actor)
         self.session = Session(actor.rig, actor.fps)
         gui = client.gui
         self.built = gui.add_html(small_text(escape(actor.verdict))) if actor.verdict else None

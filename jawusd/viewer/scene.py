@@ -60,7 +60,7 @@ def add_lights(scene: viser.SceneApi, up: tuple[float, float, float]) -> None:
 
 
 class JawScene:
-    """3-D scene of one page; `grips` are the meshes that can be dragged."""
+    """3-D scene of one page: first only skull and jaw, then `add_marks`; `grips` are the meshes that can be dragged."""
 
     def __init__(self, client: viser.ClientHandle, actor: ViewedActor) -> None:
         """Draw skull and jaw in occlusion."""
@@ -68,7 +68,6 @@ class JawScene:
         rig = actor.rig
         self._T_world_skull = np.array(rig.T_anatomical_skull)
         self._rest = rest_places(rig)
-        add_lights(self._scene, UP)
         for name in STILL:
             if name in actor.meshes:
                 mesh = actor.meshes[name]
@@ -85,7 +84,10 @@ class JawScene:
             self.grips.append(self._add_mesh(f"/jaw/{name}", actor.meshes[name], color, opacity))
         self._mandible = self.grips[moving.index("mandible")] if "mandible" in moving else None
         self._inside = True
-        self._add_landmarks(rig.landmarks)
+
+    def add_marks(self, actor: ViewedActor) -> None:
+        """Add the landmarks, the paths, and the hidden marks of pins and of the grabbed point."""
+        self._add_landmarks(actor.rig.landmarks)
         self._paths = self._add_paths(actor)
         self._pins = {name: self._ball(f"/pin/{name}", _PIN_MM, _PIN, opacity=0.6) for name in LANDMARKS}
         self._held = self._ball("/held", _MARKER_MM, _HELD)
@@ -207,9 +209,15 @@ def preset_view(rest: Array, preset: str, aspect: float = 1.0) -> tuple[Array, A
 
 
 def set_first_view(server: viser.ViserServer, rest: Array, preset: str = FIRST_VIEW) -> None:
-    """Start every page with a preset view, given the landmarks (5, 3) at rest [mm]."""
+    """Start every page lit and with a preset view, given the landmarks (5, 3) at rest [mm]."""
     target, eye = preset_view(rest, preset)
+    add_lights(server.scene, UP)
     server.scene.set_up_direction("+y")
     first = server.initial_camera
     first.position, first.look_at, first.up = tuple(eye), tuple(target), UP
-    first.fov, first.near, first.far = _FOV_RAD, _NEAR_MM, _FAR_MM
+    set_lens(first)
+
+
+def set_lens(camera: viser.CameraHandle | viser.InitialCameraConfig) -> None:
+    """Set the field of view and the clipping planes of a page's camera."""
+    camera.fov, camera.near, camera.far = _FOV_RAD, _NEAR_MM, _FAR_MM

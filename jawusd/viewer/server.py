@@ -11,6 +11,8 @@ import socket
 import sys
 import time
 from abc import ABC, abstractmethod
+from collections.abc import Callable
+from concurrent.futures import Future
 from typing import Protocol
 from urllib.parse import urlsplit
 
@@ -18,17 +20,17 @@ import viser
 
 from jawusd.base.arrays import Array
 from jawusd.base.errors import OutputError
-from jawusd.viewer import capture_scene
-from jawusd.viewer.capture_page import CapturePage
 from jawusd.viewer.page import Page, StaticPlots, begin_page
 from jawusd.viewer.scene import set_first_view
-from jawusd.viewer.viewed import ViewedActor, ViewedCapture
+from jawusd.viewer.viewed import ViewedActor
 from jawusd.viewer.widgets import set_theme
 
 log = logging.getLogger(__name__)
 
-# Time between sending the jaw and the panels: without a GPU, building the panels blocks a browser for almost a second.
-_HEAD_START_S = 0.5
+# A browser answers a request with the frame in which it handles it, and runs at most two frames ahead of what is drawn.
+# Panels are sent afterwards, since building them blocks a browser without a GPU for almost a second. Hidden pages draw
+# no frames.
+_ANSWERS, _PATIENCE_S = 4, 3.0
 _SHOW_EVERY_S = 0.1  # minimum interval between live poses that are drawn
 
 
@@ -137,13 +139,37 @@ class PageServer(ABC):
 class Viewer(PageServer):
     """Server of a rig."""
 
-    def __init__(self, actor: ViewedActor, host: str, port: int, *, play: bool = True) -> None:
-        """Start to serve an actor; see `PageServer`. With `play`, a new page plays the captured take."""
-        self._actor, self._play = actor, play
-        self._static = StaticPlots(actor.rig)
+    def __init__(
+        self,
+        load: Callable[[], ViewedActor],
+        host: str,
+        port: int,
+        *,
+        play: bool = True,
+        opened: Callable[[str], None] | None = None,
+    ) -> None:
+        """Start to serve an actor; see `PageServer`. Further errors are those of `load`, after which nothing is served.
+
+        Args:
+            load: returns the actor; called once the server accepts visitors, who wait for it.
+            play: whether a new page plays the captured take.
+            opened: called with the address before `load`, so that a browser can start meanwhile.
+        """
+        self._play = play
         self._shown_s = -math.inf
-        super().__init__(actor.name, host, port)
-        set_first_view(self._server, self._static.rest)
+        self._loaded: Future[None] = Future()
+        super().__init__("jawusd", host, port)
+        try:
+            if opened is not None:
+                opened(self.url)
+            self._actor = load()
+            self._static = StaticPlots(self._actor.rig)
+            set_first_view(self._server, self._static.rest)
+        except BaseException:
+            self._loaded.cancel()
+            self.stop()
+            raise
+        self._loaded.set_result(None)
 
     def show(self, d: Array) -> None:
         """Show the jaw at parameters (3,) [mm] on all open pages; drop poses that arrive too fast to be drawn."""
@@ -157,25 +183,21 @@ class Viewer(PageServer):
                 page.refresh()
 
     async def _page(self, client: viser.ClientHandle) -> Page:
+        await asyncio.shield(asyncio.wrap_future(self._loaded))
         scene = begin_page(client, self._actor)
-        await asyncio.sleep(_HEAD_START_S)
-        page = Page(client, scene, self._actor, self._static)
+        await asyncio.to_thread(wait_until_drawn, client)
+        with client.atomic():
+            page = Page(client, scene, self._actor, self._static)
         if self._play:
             page.play_take()
         return page
 
 
-class CaptureViewer(PageServer):
-    """Server of a capture."""
-
-    def __init__(self, capture: ViewedCapture, host: str, port: int) -> None:
-        """Start serving a capture; see `PageServer`."""
-        self._capture = capture
-        super().__init__(capture.name, host, port)
-        capture_scene.set_first_view(self._server)
-
-    async def _page(self, client: viser.ClientHandle) -> CapturePage:
-        return CapturePage(client, self._capture)
+def wait_until_drawn(client: viser.ClientHandle) -> None:
+    """Wait until a page has drawn what it was sent, has been closed, or has not answered in time."""
+    with contextlib.suppress(TimeoutError, RuntimeError):  # a page that may store nothing answers with an error
+        for _ in range(_ANSWERS):
+            client.local_storage.get_item("drawn", _PATIENCE_S)
 
 
 def is_loopback(host: str) -> bool:

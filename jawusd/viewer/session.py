@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from jawusd.base.arrays import Array
 from jawusd.evaluator import JawRig
-from jawusd.formats.keys import Keys
+from jawusd.formats.keys import DEFAULT_FPS, Keys
 from jawusd.geometry import LANDMARKS
 from jawusd.geometry.se3 import se3_inverse, transform_point
 from jawusd.viewer.motion import Clip, KeyTrack, at_frames, with_key
@@ -44,7 +44,7 @@ class Work:
     d: tuple[float, float, float] = (0.0, 0.0, 0.0)
     pins: tuple[Pin, ...] = ()
     keys: KeyTrack = ()
-    fps: float = 24.0
+    fps: float = DEFAULT_FPS
     interpolation: Interpolation = "linear"
 
 

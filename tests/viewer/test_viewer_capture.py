@@ -20,8 +20,8 @@ from jawusd.formats.performance import STATE_COLOURS, SolvedJaw, SolveState
 from jawusd.formats.tracks import load_tracks, save_tracks
 from jawusd.geometry import matrix_from_wxyz, transform_point, transform_points
 from jawusd.pipeline.view_capture import viewed_capture
+from jawusd.viewer.capture_page import CaptureViewer
 from jawusd.viewer.capture_scene import UP
-from jawusd.viewer.server import CaptureViewer
 
 
 @pytest.fixture(scope="module")

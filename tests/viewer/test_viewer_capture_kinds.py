@@ -12,7 +12,7 @@ from viewed_example import copy_example, quiet, write_true_tracks
 from jawusd.base.errors import CaptureError, FormatError
 from jawusd.cli.main import app
 from jawusd.pipeline.view_capture import viewed_capture
-from jawusd.viewer.server import CaptureViewer
+from jawusd.viewer.capture_page import CaptureViewer
 
 
 @pytest.fixture(scope="module")

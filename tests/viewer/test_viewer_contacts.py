@@ -13,7 +13,7 @@ from jawusd.viewer.server import Viewer
 def page_of(folder, rig):
     bake_rig(folder, rig, example_meshes(), name="someone", fps=FPS, table_size=17)
     actor = viewed_actor(folder)
-    running = Viewer(actor, "127.0.0.1", 0)
+    running = Viewer(lambda: actor, "127.0.0.1", 0)
     return actor, running, QuietPage(running)
 
 

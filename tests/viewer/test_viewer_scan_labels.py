@@ -15,8 +15,8 @@ from jawusd.geometry import transform_point
 from jawusd.pipeline.state import no_progress
 from jawusd.pipeline.subject import load_labelled
 from jawusd.pipeline.view_capture import viewed_capture
+from jawusd.viewer.capture_page import CaptureViewer
 from jawusd.viewer.scan_labels import ScanBrush, surface_near
-from jawusd.viewer.server import CaptureViewer
 
 
 def balls(soup: bool) -> Mesh:

@@ -6,12 +6,16 @@ import signal
 import subprocess
 import sys
 import time
+import types
+import urllib.error
+import urllib.request
 
 import pytest
 from run_jawusd import heed_signals
 
-from jawusd.base.errors import OutputError
-from jawusd.viewer.server import Viewer, is_loopback, is_own_page
+from jawusd.base.errors import FormatError, OutputError
+from jawusd.pipeline.view import open_viewer, viewed_actor
+from jawusd.viewer.server import Viewer, is_loopback, is_own_page, wait_until_drawn
 
 
 @pytest.mark.parametrize(
@@ -43,10 +47,43 @@ def test_pages_of_other_sites_are_not_served(host, origin, local, own):
 
 
 def test_an_address_of_another_machine_is_refused(folder):
-    from jawusd.pipeline.view import viewed_actor
-
     with pytest.raises(OutputError, match="cannot listen on 192.0.2.1"):
-        Viewer(viewed_actor(folder), "192.0.2.1", 0)
+        open_viewer(folder, "192.0.2.1", 0)
+
+
+def test_the_address_is_known_before_the_rig_is_read_and_closed_if_it_cannot_be(folder):
+    told = []
+
+    def load():
+        assert len(told) == 1
+        with urllib.request.urlopen(told[0], timeout=60) as page:
+            assert page.status == 200
+        return viewed_actor(folder)
+
+    viewer = Viewer(load, "127.0.0.1", 0, opened=told.append)
+    viewer.stop()
+    assert told == [viewer.url]
+    (folder / "actor.usda").write_text("#usda 1.0\n")
+    with pytest.raises(FormatError):
+        open_viewer(folder, "127.0.0.1", 0, opened=told.append)
+    with pytest.raises(urllib.error.URLError):
+        urllib.request.urlopen(told[1], timeout=60)
+
+
+def test_panels_wait_for_the_drawn_jaw_but_not_forever():
+    class Storage:
+        def __init__(self, error):
+            self.error, self.asked = error, 0
+
+        def get_item(self, key, timeout):
+            self.asked += 1
+            if self.error is not None:
+                raise self.error
+
+    for error, asked in ((None, 4), (TimeoutError(), 1), (RuntimeError("closed"), 1)):
+        storage = Storage(error)
+        wait_until_drawn(types.SimpleNamespace(local_storage=storage))
+        assert storage.asked == asked
 
 
 def run_view(folder, *options):
