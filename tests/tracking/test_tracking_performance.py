@@ -2,6 +2,7 @@
 
 import shutil
 from dataclasses import replace
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -14,7 +15,7 @@ from jawusd.base.errors import TrackingError
 from jawusd.evaluator import JawRig
 from jawusd.evaluator.skin import SkinJaw
 from jawusd.formats.performance import SolveState
-from jawusd.geometry import relative_pose, transform_point, transform_points
+from jawusd.geometry import LANDMARKS, relative_pose, se3_exp, transform_point, transform_points
 from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.contour.annotator import DRAWN
 from jawusd.tracking.contour.equations import twist_between
@@ -24,7 +25,7 @@ from jawusd.tracking.contour.views import MaskViews, masked_sources
 from jawusd.tracking.initialization.footage import Footage
 from jawusd.tracking.performance.attempts import FrameFit
 from jawusd.tracking.performance.coordinates import LOCAL, Coordinates, Pose
-from jawusd.tracking.performance.instant import Expected, InstantSolver
+from jawusd.tracking.performance.instant import Equations, Expected, InstantSolver
 from jawusd.tracking.performance.shot import Shot, solve_performance
 from jawusd.tracking.performance.single_start import SingleStart
 from jawusd.tracking.performance.smoother import Smoother
@@ -58,8 +59,11 @@ def folder(jaw, truth, tmp_path_factory):
     return write_masks(tmp_path_factory.mktemp("shot"), jaw, truth, small_take.CAMERAS)
 
 
-def write_masks(out, jaw, truth, cameras, grown_px=(0.0, 0.0), hidden=HIDDEN):
-    """Write the masks of the take, whose outlines lie `grown_px` outside of the upper and lower teeth."""
+def write_masks(out, jaw, truth, cameras, grown_px=(0.0, 0.0), hidden=HIDDEN, misfits=None):
+    """Write the masks of the take, whose outlines lie `grown_px` outside of the upper and lower teeth.
+
+    `misfits` are twists of the mandible away from the rig's pose, by frame.
+    """
     rng = np.random.default_rng(0)
     for camera in cameras:
         for row in small_take.ROWS:
@@ -67,7 +71,8 @@ def write_masks(out, jaw, truth, cameras, grown_px=(0.0, 0.0), hidden=HIDDEN):
         for k, (d, head) in enumerate(zip(*truth)):
             if k in hidden:
                 continue
-            shown = small_take.MESHES, np.stack([head, head @ jaw.pose(d)]), camera, None, 0.3, rng
+            lower = head @ se3_exp((misfits or {}).get(k, np.zeros(6))) @ jaw.pose(d)
+            shown = small_take.MESHES, np.stack([head, lower]), camera, None, 0.3, rng
             masks = {grown: render_masks(*shown, grown_px=grown) for grown in sorted(set(grown_px))}
             for r, row in enumerate(small_take.ROWS):
                 mask = masks[grown_px[r]][r]
@@ -166,6 +171,25 @@ def test_a_wrong_mask_in_one_of_three_cameras_costs_no_frame(jaw, scans, truth, 
     np.testing.assert_array_equal(unused, [[np.flatnonzero(seen() == k)[0], 1, 1]])
 
 
+def test_a_jaw_that_the_rig_cannot_reproduce_moves_no_head(jaw, scans, truth, tmp_path):
+    """Two cameras; in two of the frames, one of these has no mask of the upper teeth."""
+    strange = range(6, 10)
+    misfits = {k: np.array([0.02, 0.0, 0.0, 0.4, -0.9, 1.4]) for k in strange}
+    folder = write_masks(tmp_path, jaw, truth, small_take.CAMERAS[:2], misfits=misfits)
+    for k in (6, 9):
+        small_take.png(folder, "cam1", "upper", k).unlink()
+    table = {name: {"base_mm": 0.4, "per_mm": 0.0} for name in LANDMARKS}
+    unsure, crown = JawRig(jaw.arrays, {**jaw.meta, "uncertainty": table}), scans[0].vertices[::50]
+
+    def head_mm(rig):
+        found = solved(rig, scans, truth, folder, small_take.CAMERAS[:2])
+        away = transform_points(found.T_world_upper, crown) - transform_points(truth[1], crown)
+        return np.linalg.norm(away, axis=-1).mean(1)[strange].max()
+
+    found = head_mm(unsure), head_mm(jaw)
+    assert found[0] < 0.25 < 0.5 < found[1], found
+
+
 def test_skin_measures_the_jaw_while_one_camera_sees_no_teeth(jaw, scans, truth, tmp_path):
     """Skin with an unknown offset, and two strange faces with a large error; half of the frames show no teeth."""
     hidden, strange = np.arange(6, 20), np.array([11, 12])
@@ -213,7 +237,8 @@ def test_residuals_are_looked_at_again_after_long_steps(jaw, scans, truth, monke
     solver = ContourSolver(scans, replace(TrackingConfig(), judged_mm=judged_mm))
     instants, finals = InstantSolver(solver, Coordinates(jaw, scans)), []
     monkeypatch.setattr(instants, "linearise", lambda *_, final=False: finals.append(final))
-    monkeypatch.setattr(instants, "equations", lambda *_: (np.eye(9), np.r_[np.zeros(8), step_mm]))
+    equations = Equations(np.eye(9), np.r_[np.zeros(8), step_mm], SimpleNamespace(after=lambda step: np.zeros(6)))
+    monkeypatch.setattr(instants, "equations", lambda *_: equations)
     start = Pose(truth[1][0], truth[0][0])
     found = instants.align(start, [], np.ones((2, 0), bool), (2.0,), Expected(start, np.zeros(9)), np.ones(2))
     assert finals == [False, True][: 1 + again]

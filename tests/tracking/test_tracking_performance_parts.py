@@ -25,6 +25,7 @@ from jawusd.geometry import (
 from jawusd.tracking.contour.annotator import DRAWN, AnnotatorPrior
 from jawusd.tracking.performance.coordinates import HEAD, JAW, LOCAL, OPENING, Coordinates, Pose
 from jawusd.tracking.performance.instant import CLOSED_MM, bound_equations, rig_gain
+from jawusd.tracking.performance.misfit import Misfit
 from jawusd.tracking.performance.motion import measured_motion
 from jawusd.tracking.performance.results import tracks_of
 from jawusd.tracking.performance.system import TakeSystem
@@ -208,6 +209,38 @@ def test_an_error_of_the_rig_moves_d_as_in_a_least_squares_fit(jaw, fixed_head):
     matrix = sum(slope.T @ root.T @ root @ slope for slope, root in zip(slopes, roots))
     gain = rig_gain(coordinates, pose, matrix, roots[1].T @ roots[1], fixed_head=fixed_head)
     np.testing.assert_allclose(gain @ error, found, rtol=2e-3, atol=1e-7)
+
+
+def test_a_misfit_is_eliminated_as_the_full_system_would(jaw):
+    """Compare a step, and the misfit after it, with the solution of the equations that include the misfit."""
+    rng, unknowns = np.random.default_rng(2), 11
+    coordinates = Coordinates(jaw, [SimpleNamespace(centre=np.array([0.0, y, -9.0])) for y in (4.0, -6.0)])
+    pose = Pose(np.eye(4), np.array([8.0, 1.0, 0.5]), rng.normal(size=6) * 0.01)
+    root, slope = rng.normal(size=(9, 6)), rng.normal(size=(6, unknowns))
+    precision, error = root.T @ root, coordinates.error_slope(pose)
+    gradient, of_rig = rng.normal(size=6), np.diag(rng.uniform(0.1, 1.0, 6))
+    coupling, left = precision @ slope, rng.normal(size=unknowns)
+    own = slope.T @ coupling + np.eye(unknowns)
+    misfit = Misfit(coordinates, pose, (precision, gradient), coupling, of_rig)
+    step = np.linalg.solve(own + misfit.matrix, left + misfit.right)
+    cross = coupling.T @ error
+    full = np.block([[own, cross], [cross.T, error.T @ precision @ error + np.linalg.inv(of_rig)]])
+    right = np.r_[left, error.T @ gradient - np.linalg.solve(of_rig, pose.misfit)]
+    expected = np.linalg.solve(full, right)
+    np.testing.assert_allclose(step, expected[:unknowns], atol=1e-9)
+    np.testing.assert_allclose(misfit.after(step), pose.misfit + expected[unknowns:], atol=1e-9)
+
+
+@pytest.mark.parametrize(("beyond_mm", "pull_mm"), [(0.3, 0.3), (3.0, 0.6), (9.0, 0.6)])
+def test_the_pull_of_the_bound_does_not_grow_far_beyond_it(jaw, beyond_mm, pull_mm):
+    coordinates = Coordinates(jaw, [SimpleNamespace(centre=np.zeros(3))] * 2)
+    inside, outside = np.array([8.0, 0.0, 0.5]), np.array([8.0, 30.0, 0.5])
+    share = scipy.optimize.brentq(lambda x: jaw.margin(inside + x * (outside - inside)) + beyond_mm, 0.0, 1.0)
+    d = inside + share * (outside - inside)
+    matrix, right = bound_equations(coordinates, d)
+    gradient = jaw.margin_gradient(d)
+    np.testing.assert_allclose(right[JAW], pull_mm * gradient, rtol=1e-3)
+    np.testing.assert_allclose(matrix[JAW, JAW] * beyond_mm, pull_mm * np.outer(gradient, gradient), rtol=1e-3)
 
 
 def test_teeth_cannot_close_below_the_smallest_captured_opening(jaw):

@@ -7,7 +7,7 @@ about the pivot, which is the centre of the upper crowns; the last three are the
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -34,6 +34,8 @@ class Pose:
 
     head: Array  # T_world_upper, shape (4, 4)
     d: Array  # jaw parameters [mm], shape (3,)
+    # part of the mandible's pose that the rig cannot reproduce: a left twist in the skull frame [rad, mm], shape (6,)
+    misfit: Array = field(default_factory=lambda: np.zeros(6))
 
 
 class Coordinates:
@@ -54,7 +56,10 @@ class Coordinates:
 
     def arches(self, pose: Pose) -> Array:
         """Return T_world_upper and T_world_lower, shape (2, 4, 4)."""
-        return np.stack([pose.head, pose.head @ self.jaw.pose(pose.d)])
+        relative = self.jaw.pose(pose.d)
+        if pose.misfit.any():
+            relative = se3_exp(pose.misfit) @ relative
+        return np.stack([pose.head, pose.head @ relative])
 
     def pose_of(self, arches: Array) -> Pose:
         """Return the rig pose nearest to the given poses of the two arches, shape (2, 4, 4)."""
@@ -85,7 +90,7 @@ class Coordinates:
 
     def moved(self, pose: Pose, step: Array) -> Pose:
         """Return a pose after a step of the nine unknowns, shape (9,)."""
-        return Pose(self.turned(pose.head, step[HEAD]), pose.d + step[JAW])
+        return replace(pose, head=self.turned(pose.head, step[HEAD]), d=pose.d + step[JAW])
 
     def turned(self, head: Array, twist: Array) -> Array:
         """Return T_world_upper, shape (..., 4, 4), after twists in the head's axes about the pivot, shape (..., 6)."""

@@ -15,7 +15,7 @@ from jawusd.tracking.contour.quality import correlation_px, residual_px
 from jawusd.tracking.contour.scan import ARCHES
 from jawusd.tracking.contour.solver import Matched
 from jawusd.tracking.performance.attempts import LARGEST_SIGMA, Attempts, FrameFit, usual_residual_px
-from jawusd.tracking.performance.coordinates import HEAD, JAW, LOCAL, Coordinates
+from jawusd.tracking.performance.coordinates import HEAD, JAW, LOCAL, Coordinates, Pose
 from jawusd.tracking.performance.instant import InstantSolver, rig_gain
 from jawusd.tracking.performance.motion import Motion, head_bends, measured_motion
 from jawusd.tracking.performance.skin import SLOW, SkinFactor
@@ -120,7 +120,7 @@ class Smoother:
             own, more = np.split(local, [self._unknowns.local], axis=1)
             poses, state = self._unknowns.moved([fit.pose for fit in fits], state, own, shared)
             slow = slow + more if self._skin is not None else slow
-            fits = [replace(fit, pose=pose) for fit, pose in zip(fits, poses, strict=True)]
+            fits = [self._moved(fit, pose, weight) for fit, pose in zip(fits, poses, strict=True)]
             if round_ == self._rounds:
                 break
             if round_ == 0:
@@ -137,15 +137,19 @@ class Smoother:
         gains = np.stack([self._rig_gain(fit, weight) for fit in fits])
         return Smoothed(fits, covariance, state, sigma, self._by_skin(len(fits)), gains)
 
+    def _moved(self, fit: FrameFit, pose: Pose, weight: Array) -> FrameFit:
+        """Return the fit of a frame at another pose, with the misfit that belongs to it."""
+        if fit.solution is not None and fit.found[1]:
+            misfit = self._instants.outline_equations(fit.pose, fit.solution, weight).misfit
+            pose = replace(pose, misfit=misfit.after(self._coordinates.step(fit.pose, pose)))
+        return replace(fit, pose=pose)
+
     def _rig_gain(self, fit: FrameFit, weight: Array) -> Array:
         """Return the derivative (3, 6) of d with respect to an error of the rig; 0 where d is not from outlines."""
         if fit.solution is None or not fit.found[1]:
             return np.zeros((3, 6))
-        matrix = (
-            np.diag(LARGEST_SIGMA**-2.0)
-            + self._instants.outline_equations(fit.pose, fit.solution, weight * fit.found)[0]
-        )
-        lower = weight[1] * fit.solution.outline.precision[1].sum(0)
+        outlines = self._instants.outline_equations(fit.pose, fit.solution, weight * fit.found)
+        matrix, lower = np.diag(LARGEST_SIGMA**-2.0) + outlines.matrix, outlines.misfit.precision
         return rig_gain(self._coordinates, fit.pose, matrix, lower, fixed_head=self._unknowns.fixed_head)
 
     def _by_skin(self, count: int) -> Mask:

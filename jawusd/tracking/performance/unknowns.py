@@ -17,6 +17,7 @@ from jawusd.tracking.contour.views import View
 from jawusd.tracking.performance.attempts import FrameFit
 from jawusd.tracking.performance.coordinates import HEAD, JAW, LOCAL, Coordinates, Pose
 from jawusd.tracking.performance.instant import bound_equations
+from jawusd.tracking.performance.misfit import Misfit
 from jawusd.tracking.performance.views import PRIOR_LOG_FOCAL, with_focal
 
 
@@ -104,7 +105,8 @@ class Unknowns:
             sums = solution.outline
             to_twist, to_habit = np.zeros((6, size)), np.zeros((self._cameras, COMPONENTS, size))
             to_twist[:, :LOCAL], to_habit[..., bias] = slope, self._layers[r]
-            both = to_twist.T @ np.einsum("chi,chn->in", sums.habit_slope[r], to_habit)
+            to_outline = np.einsum("chi,chn->in", sums.habit_slope[r], to_habit)
+            both = to_twist.T @ to_outline
             own = np.einsum("chn,chk,ckm->nm", to_habit, sums.habit_weight[r], to_habit, optimize=True)
             own += to_twist.T @ sums.precision[r].sum(0) @ to_twist
             matrix += weight[r] * (own + both + both.T)
@@ -118,6 +120,13 @@ class Unknowns:
                 matrix[:, columns] += weight[r] * cross.T
                 matrix[columns, columns] += weight[r] * np.diag(fit.growth.own[r])
                 right[columns] += weight[r] * fit.growth.distance[r]
+                to_outline[:, columns] += fit.growth.twist[r].T
+            if r:
+                precision, gradient = weight[r] * sums.precision[r].sum(0), weight[r] * sums.gradient[r].sum(0)
+                coupling = precision @ to_twist + weight[r] * to_outline
+                misfit = Misfit(self._coordinates, pose, (precision, gradient), coupling)
+                matrix += misfit.matrix
+                right += misfit.right
         if not self.fixed_head:
             return matrix, right
         order = np.r_[np.arange(LOCAL)[JAW], np.arange(LOCAL)[HEAD], np.arange(LOCAL, size)]

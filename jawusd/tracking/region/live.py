@@ -103,8 +103,8 @@ class LiveTake:
         precision, of_rig = np.diag(self._tracker.expected.precision), np.zeros((3, 3))
         if fit.solution is not None and fit.found.any():
             weight = np.where(fit.found, 1.0 / (residual_px(fit.solution) ** 2 * CORRELATION_PX), 0.0)
-            precision = precision + self._instants.outline_equations(fit.pose, fit.solution, weight)[0]
-            lower = weight[1] * fit.solution.outline.precision[1].sum(0)
-            gain = rig_gain(self.coordinates, fit.pose, precision, lower)
+            outlines = self._instants.outline_equations(fit.pose, fit.solution, weight)
+            precision = precision + outlines.matrix
+            gain = rig_gain(self.coordinates, fit.pose, precision, outlines.misfit.precision)
             of_rig = gain @ self.coordinates.jaw.pose_covariance(fit.pose.d) @ gain.T
         return np.asarray(_WIDER**2 * np.linalg.inv(precision)[JAW, JAW] + of_rig, np.float64)
