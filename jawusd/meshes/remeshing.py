@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 import pyfqmr
-import trimesh
 from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
@@ -12,6 +13,9 @@ from scipy.sparse.csgraph import connected_components
 from jawusd.base.arrays import Array, Mask
 from jawusd.formats.mesh import GUM, TOOTH, Mesh, crown_face_mask
 from jawusd.geometry.points import welded
+
+if TYPE_CHECKING:
+    import trimesh
 
 # Offset [mm] by which parts of a surface that touch in a single point are separated; validators report coincident
 # points as unmerged seams.
@@ -84,6 +88,8 @@ def manifold(mesh: Mesh) -> Mesh:
     Coincident points are merged, degenerate and duplicate faces dropped; at edges with more than two faces, only the
     two largest faces are kept; connected faces are wound consistently; parts that touch in one point are separated.
     """
+    import trimesh  # takes half a second, and is needed when rigs are baked only
+
     surface = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     surface.merge_vertices()
     surface.update_faces(surface.unique_faces() & surface.nondegenerate_faces())
