@@ -20,12 +20,7 @@ from jawusd.formats.tracks import LOST
 from jawusd.pipeline.cameras import open_colour_footage
 from jawusd.pipeline.picture_search import PictureSearch, picks_outside
 from jawusd.pipeline.segment_guide import known_guide, save_guide
-from jawusd.pipeline.segment_record import (
-    LEARNED,
-    CameraEntry,
-    FrameEntry,
-    Journal,
-)
+from jawusd.pipeline.segment_record import LEARNED, CameraEntry, FrameEntry, Journal, TrackEntry
 from jawusd.pipeline.state import Progress, hash_files, hash_value
 from jawusd.pipeline.subject import load_meshes, subject_of_capture
 from jawusd.pipeline.track_videos import Follower
@@ -239,15 +234,9 @@ class _Segmentation:
         from jawusd.tracking.contour.frame_record import FrameSummary
 
         poses, status = self._journal.known(frame)
-        kept = self._journal.entries[frame]["track"]
-        return FrameSummary(
-            poses,
-            status,
-            np.array(kept["used"], bool),
-            np.array(kept["coverage"], np.float64),
-            np.array(kept["score_px"], np.float64),
-            np.array(kept["residual_px"], np.float64),
-        )
+        track = dict(self._journal.entries[frame]["track"])
+        used = np.array(track.pop("used"), bool)
+        return FrameSummary(poses, status, used, **{name: np.array(kept, np.float64) for name, kept in track.items()})
 
     def _keyed(self) -> list[int]:
         """Return the frames that have drawn masks or strokes, and known poses."""
@@ -334,12 +323,7 @@ class _Segmentation:
             "poses": past.poses.tolist(),
             "status": past.status.tolist(),
             "cameras": cameras,
-            "track": {
-                "used": past.used.tolist(),
-                "coverage": past.coverage.tolist(),
-                "score_px": past.score_px.tolist(),
-                "residual_px": past.residual_px.tolist(),
-            },
+            "track": TrackEntry(**{name: getattr(past, name).tolist() for name in TrackEntry.__annotations__}),
         }
         if again:
             entry["again"] = True

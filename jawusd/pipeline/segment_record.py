@@ -10,7 +10,7 @@ import contextlib
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import NotRequired, TypedDict
+from typing import NotRequired, TypedDict, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -202,13 +202,11 @@ def summarise(entries: Mapping[int, FrameEntry]) -> list[MaskConfidence]:
     found = [entries[frame]["cameras"][name] for frame, name in keys]
     cameras = np.array([name for _, name in keys])
     everywhere = np.full(len(keys), "")
-    measured = {
-        "contrast": _pairs([entry["contrast"] for entry in found]),
-        "unexpected": _pairs([entry["unexpected"] for entry in found]),
-        "residual_px": _pairs([entry["residual_px"] for entry in found]),
-        "uncovered": _pairs([entry["uncovered"] for entry in found]),
-    }
-    parts = [_off(sign * measured[name], cameras, _LEAST_SPREAD[name]) for name, sign in _SYMPTOMS.items()]
+    pairs = cast("list[Mapping[str, Pair]]", found)
+    parts = [
+        _off(sign * np.array([entry[name] for entry in pairs], np.float64), cameras, _LEAST_SPREAD[name])
+        for name, sign in _SYMPTOMS.items()
+    ]
     parts.append(_off(_outline_doubt(found), everywhere, _OUTLINE_SPREAD) * (_USUAL_OFF / _OUTLINE_OFF))
     off = np.stack(parts, axis=-1)  # shape (N, 2, number of symptoms)
     lost = np.array([[state == LOST for state in entries[frame]["status"]] for frame, _ in keys])
@@ -227,11 +225,6 @@ def summarise(entries: Mapping[int, FrameEntry]) -> list[MaskConfidence]:
             }
         )
     return rows
-
-
-def _pairs(values: Sequence[Pair]) -> Array:
-    """Return pairs as an array, shape (N, 2), with NaN in place of None."""
-    return np.array(values, np.float64)
 
 
 def _outline_doubt(found: Sequence[CameraEntry]) -> Array:
