@@ -29,6 +29,9 @@ MandiblePrim = Annotated[
 SkullPrim = Annotated[
     str | None, typer.Option("--skull", help="For a stage: prim above the meshes of skull or upper teeth.")
 ]
+#: Sources from which a motion can be read.
+Origin = Literal["d", "mandible"]
+_ORIGINS: dict[Origin, str] = {"d": "values of d", "mandible": "mandible's transforms"}
 
 
 def encode(
@@ -196,13 +199,6 @@ def judged_lines(judged: dict[str, float]) -> list[str]:
         where = f"worst at frame {judged['worst_frame']:g}, margin {judged['worst_margin_mm']:.2f} mm"
         lines.append(f"{judged['outside']} of {judged['frames']} samples lay outside the bound; {where}")
     return lines
-
-
-_ORIGINS = {"d": "values of d", "mandible": "mandible's transforms"}
-
-
-#: Sources from which a motion can be read.
-Origin = Literal["d", "mandible"]
 
 
 def rebake(

@@ -7,6 +7,7 @@ rendering along its distorted ray, so that straight edges bend as in a real lens
 from __future__ import annotations
 
 from dataclasses import dataclass
+from importlib import resources
 
 import moderngl
 import numpy as np
@@ -16,7 +17,6 @@ from jawusd.base.arrays import Array
 from jawusd.base.errors import MissingDependencyError
 from jawusd.geometry import Camera, se3_inverse
 from jawusd.meshes.surfaces import vertex_normals
-from jawusd.synthetic import shaders
 from jawusd.synthetic.anatomy import Surface
 
 NEAR_MM, FAR_MM = 80.0, 700.0
@@ -61,13 +61,18 @@ class Renderer:
         self._margin = 16 + int(0.01 * max(self._size)) * _SCALE
         width, height = (_SCALE * s + 2 * self._margin for s in self._size)
         self._scene_size = (width, height)
-        self._scene_program = self._gl.program(shaders.SCENE_VERTEX, shaders.SCENE_FRAGMENT)
-        self._shadow_program = self._gl.program(shaders.SCREEN_VERTEX, shaders.SHADOW_FRAGMENT)
-        self._lens_program = self._gl.program(shaders.SCREEN_VERTEX, shaders.LENS_FRAGMENT)
+        self._scene_program = self._program("scene.vert", "scene.frag")
+        self._shadow_program = self._program("screen.vert", "shadow.frag")
+        self._lens_program = self._program("screen.vert", "lens.frag")
         self._make_targets()
         self._grain = self._grain_texture()
         self._bends = [self._bend_texture(camera) for camera in cameras]
         self._jitters: dict[str, moderngl.Texture] = {}
+
+    def _program(self, *names: str) -> moderngl.Program:
+        """Compile a program from the files of its vertex and fragment shader."""
+        folder = resources.files("jawusd.synthetic") / "shaders"
+        return self._gl.program(*((folder / name).read_text(encoding="utf-8") for name in names))
 
     def __enter__(self) -> Renderer:
         return self
