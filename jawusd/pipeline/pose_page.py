@@ -70,7 +70,7 @@ def write_page(
 def _footage(folder: Path) -> PageFootage:
     """Return the footage of a build's take, reduced in size and frame rate."""
     from jawusd.media.overlay import encode_jpeg
-    from jawusd.pipeline.view_footage import take_footage
+    from jawusd.pipeline.view_capture import take_footage
     from jawusd.report.pose_page import PageFootage
 
     taken = take_footage(folder, _TILE_PX)

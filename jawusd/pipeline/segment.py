@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
@@ -323,7 +323,7 @@ class _Segmentation:
             "poses": past.poses.tolist(),
             "status": past.status.tolist(),
             "cameras": cameras,
-            "track": TrackEntry(**{name: getattr(past, name).tolist() for name in TrackEntry.__annotations__}),
+            "track": cast(TrackEntry, {name: getattr(past, name).tolist() for name in TrackEntry.__annotations__}),
         }
         if again:
             entry["again"] = True

@@ -102,7 +102,7 @@ def _footage(folder: Path) -> ViewedFootage | None:
     """Return the footage of a captured take; packages that read captures are loaded only for folders with tracks."""
     if not (folder / _TRACKS).is_file():
         return None
-    from jawusd.pipeline.view_footage import take_footage
+    from jawusd.pipeline.view_capture import take_footage
 
     return take_footage(folder)
 

@@ -69,10 +69,11 @@ class Renderer:
         self._bends = [self._bend_texture(camera) for camera in cameras]
         self._jitters: dict[str, moderngl.Texture] = {}
 
-    def _program(self, *names: str) -> moderngl.Program:
+    def _program(self, vertex: str, fragment: str) -> moderngl.Program:
         """Compile a program from the files of its vertex and fragment shader."""
         folder = resources.files("jawusd.synthetic") / "shaders"
-        return self._gl.program(*((folder / name).read_text(encoding="utf-8") for name in names))
+        first, second = ((folder / name).read_text(encoding="utf-8") for name in (vertex, fragment))
+        return self._gl.program(first, second)
 
     def __enter__(self) -> Renderer:
         return self

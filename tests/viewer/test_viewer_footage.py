@@ -9,8 +9,8 @@ from viewed_example import EXAMPLE, FIRST, record_build
 
 from jawusd.media.overlay import UPPER_COLOUR
 from jawusd.pipeline.view import open_viewer
-from jawusd.pipeline.view_footage import take_footage
-from jawusd.viewer.footage_panel import OFF
+from jawusd.pipeline.view_capture import take_footage
+from jawusd.viewer.page import OFF
 
 CAMERAS = ("cam0", "cam1", "cam2")
 
