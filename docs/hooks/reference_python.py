@@ -2,7 +2,7 @@
 
 STAGES = (
     "build", "track", "fit", "bake", "check", "calibrate", "segment", "scans", "solve", "live", "report",
-    "library", "many", "start_capture", "doctor", "cameras",
+    "library", "many", "start_capture", "cameras",
     "subject", "workspace", "skin",
 )  # fmt: skip
 

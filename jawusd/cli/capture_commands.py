@@ -61,7 +61,7 @@ def doctor(as_json: Json = False) -> None:
     Exit code 1 if something that a build needs is missing.
     """
     from jawusd.cli.text_capture import examined_lines
-    from jawusd.pipeline.doctor import examine
+    from jawusd.pipeline.check import examine
 
     found = examine()
     emit(found, as_json, lambda: examined_lines(found))

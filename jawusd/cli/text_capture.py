@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from jawusd.geometry import Camera
     from jawusd.photographs.align import PhotographFiles
     from jawusd.pipeline.calibrate import CalibrationSummary, SyncResult
-    from jawusd.pipeline.doctor import Examined
+    from jawusd.pipeline.check import Examined
     from jawusd.pipeline.scans import ScansSummary
     from jawusd.pipeline.segment_record import SegmentSummary
     from jawusd.pipeline.start_capture import CaptureStart
