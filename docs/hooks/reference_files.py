@@ -24,8 +24,7 @@ FILES = {
         "Marker positions: rigid bodies": "jawusd.formats.rigid_bodies",
         "Keys: keys.json": "jawusd.formats.keys",
         "Faces: CSV of columns or points": "jawusd.formats.face_table",
-        "Face models: correspondences, and alignment: JSON": "jawusd.formats.alignment",
-        "Face models: jaw motion in npz": "jawusd.formats.face_track",
+        "Face models: correspondences and alignment in JSON, jaw motion in npz": "jawusd.formats.alignment",
         "ARKit face captures: CSV": "jawusd.formats.arkit",
     },
     "What comes out": {

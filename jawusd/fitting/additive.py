@@ -22,7 +22,7 @@ from jawusd.evaluator.models import AdditiveModel
 from jawusd.fitting.data import PARAMETERS, FittedForm, TrainingData
 from jawusd.fitting.gauge_fit import fit_gauge, fit_path
 from jawusd.fitting.metric import velocity_of
-from jawusd.fitting.spline import choose_smoothing, ridge_solve, within
+from jawusd.fitting.spline import choose_smoothing, folds_of, ridge_solve, within
 from jawusd.geometry import se3_exp, se3_left_jacobian, se3_log
 
 #: Map from a parameter t (n,) to twists (n, 6) and their derivatives with respect to t (n, 6); zero twist at t = 0.
@@ -42,7 +42,6 @@ _SMOOTHING = 10.0 ** np.arange(-4.0, 5.0)
 _TAIL_RIDGE = 1e-4  # penalty that keeps coefficients finite in intervals without frames
 _HIDDEN_RIDGE = 1e9  # penalty that keeps coefficients at zero for parameters that the data do not excite
 _TRIM_FLOOR_MM = 0.8  # maximum residual that counts as model error and not as a tracking failure [mm]
-_CV_BLOCK, _CV_FOLDS, _CV_CAP_MM = 25, 5, 1.0
 _LARGEST_CONDITION = 1e3
 
 
@@ -166,9 +165,9 @@ def _regress(data: TrainingData, t: Array, kept: Mask, shown: Mask) -> tuple[Add
     L = np.linalg.cholesky(data.metric.about(data.incisor))
     turning = twists[:, :3] @ L
     gliding = (np.cross(twists[:, :3], data.incisor) + twists[:, 3:]) @ MEASURED.T - t
-    folds = (np.arange(len(data)) // _CV_BLOCK % _CV_FOLDS)[kept]
+    folds = folds_of(len(data))[kept]
     every, energy, tail = _assembled(columns, bases, shown, (0, 1, 2))
-    smoothing = choose_smoothing(every, turning, weights, energy, tail, _SMOOTHING, folds, _CV_CAP_MM)
+    smoothing = choose_smoothing(every, turning, weights, energy, tail, _SMOOTHING, folds)
     turn = _solve(every, turning, weights, smoothing * energy + tail, columns)
     turn = [np.linalg.solve(L.T, part.T).T for part in turn]
     glide = [np.zeros((columns[i].shape[1], 3)) for i in range(3)]

@@ -28,7 +28,7 @@ from jawusd.evaluator.gauge import Gauge
 from jawusd.evaluator.models import AnchoredModel
 from jawusd.fitting.data import MODEL_SIGMA_MM, FittedForm, TrainingData, displacement
 from jawusd.fitting.gauge_fit import fit_gauge, fit_path
-from jawusd.fitting.spline import SplineBasis, choose_smoothing, farthest_points, ridge_solve, within
+from jawusd.fitting.spline import SplineBasis, choose_smoothing, farthest_points, folds_of, ridge_solve, within
 from jawusd.geometry import make_transform, so3_exp, so3_log
 
 _SLIDE_SCALE_MM, _OPENING_SCALE_MM = 10.0, 40.0  # lengths that normalise the arguments of the polynomials
@@ -47,8 +47,6 @@ _SCALES_MM = np.array([10.0, 7.0, 5.0])  # length scales of the fitted function 
 # Length scale for parameters that the data do not excite, so large that the fitted function f does not depend on them.
 _HIDDEN_SCALE_MM = 1e9
 _SMOOTHING = 10.0 ** np.arange(-6.0, 4.0)
-_CV_BLOCK, _CV_FOLDS = 25, 5  # number of frames held out together (one second), and number of folds
-_CV_CAP_MM = 1.0
 _TAIL_RIDGE = 1e-6  # penalty that keeps the linear coefficients finite along a direction without motion
 _FRAMES_PER_CENTRE = 4
 _TRIM_FLOOR_MM = 0.5
@@ -226,7 +224,7 @@ def _regress(data: TrainingData, u: Array, kept: Mask, chart: _Chart, guided: bo
     """
     rotation = data.metric.best_rotation(data.motion, data.incisor, u + data.incisor)[kept]
     omega, q, weights = so3_log(rotation), chart.of(u[kept]), data.weights[kept]
-    folds = (np.arange(len(data)) // _CV_BLOCK % _CV_FOLDS)[kept]
+    folds = folds_of(len(data))[kept]
     if guided:
         motion = make_transform(rotation, u[kept] + data.incisor - rotation @ data.incisor)
         more = _guided_rows(data, motion, weights, chart)
@@ -240,7 +238,7 @@ def _regress(data: TrainingData, u: Array, kept: Mask, chart: _Chart, guided: bo
     columns = basis.columns(q)
     tail = np.zeros_like(basis.energy)
     tail[-3:, -3:] = _TAIL_RIDGE * np.eye(3)
-    smoothing = choose_smoothing(columns, values, weights, basis.energy, tail, _SMOOTHING, folds, _CV_CAP_MM)
+    smoothing = choose_smoothing(columns, values, weights, basis.energy, tail, _SMOOTHING, folds)
     weighted = columns * weights[:, None]
     fitted = ridge_solve(weighted.T @ columns, weighted.T @ values, smoothing * basis.energy + tail)
     spline = basis.weights(np.linalg.solve(L.T, fitted.T).T)

@@ -10,11 +10,11 @@ from scipy.spatial import cKDTree
 from jawusd.base.arrays import Array
 from jawusd.evaluator.models import JawModelForm
 from jawusd.fitting.data import FittedForm, TrainingData
+from jawusd.formats.model import error_table
+from jawusd.formats.notes import ErrorTable
 from jawusd.geometry import LANDMARKS, transform_point
 
 Refit = Callable[[TrainingData], FittedForm]
-#: Mean, median, p95, max [mm] and number of frames, by landmark or "mandible".
-ErrorTable = dict[str, dict[str, float]]
 
 # Fraction of held-out errors, weighted by distance, that are below their quantile at the expected growth; and this
 # quantile relative to the rms error for three normally distributed coordinates.
@@ -36,26 +36,11 @@ def pose_errors(data: TrainingData, model: Array) -> dict[str, Array]:
     return errors
 
 
-def summarise(errors: dict[str, Array]) -> ErrorTable:
-    """Return the error table for columns of per-frame errors [mm]; empty columns are omitted."""
-    return {
-        name: {
-            "mean": float(values.mean()),
-            "median": float(np.median(values)),
-            "p95": float(np.percentile(values, 95)),
-            "max": float(values.max()),
-            "frames": len(values),
-        }
-        for name, values in errors.items()
-        if len(values)
-    }
-
-
 def seen_errors(data: TrainingData, form: FittedForm) -> dict[str, ErrorTable]:
     """Return the error tables "train", over the kept frames, and "trimmed", over the other frames if there are any."""
-    tables = {"train": summarise(_errors(data.select(form.kept), form))}
+    tables = {"train": error_table(_errors(data.select(form.kept), form))}
     if not form.kept.all():
-        tables["trimmed"] = summarise(_errors(data.select(~form.kept), form))
+        tables["trimmed"] = error_table(_errors(data.select(~form.kept), form))
     return tables
 
 
@@ -87,7 +72,7 @@ def unseen_errors(
     distance, trained = np.concatenate(distances), _errors(data.select(form.kept), form)
     growth = {name: _growth(distance, values, trained[name]) for name, values in pooled.items()}
     rms = np.sqrt(np.mean([pooled[name] ** 2 for name in LANDMARKS], axis=0))
-    return summarise(pooled), growth, rms
+    return error_table(pooled), growth, rms
 
 
 def _errors(data: TrainingData, form: FittedForm) -> dict[str, Array]:

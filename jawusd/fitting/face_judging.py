@@ -11,9 +11,8 @@ from jawusd.base.arrays import Array
 from jawusd.base.errors import FormatError
 from jawusd.evaluator import JawRig
 from jawusd.evaluator.verdicts import Verdicts
-from jawusd.formats.alignment import Alignment, motion_of_points
+from jawusd.formats.alignment import Alignment, motion_of_points, read_jaw_track
 from jawusd.formats.atomic import write_text_atomic
-from jawusd.formats.face_track import read_jaw_track
 from jawusd.geometry import se3_inverse, transform_points
 
 # Number of standard deviations of the alignment error by which thresholds are widened.
@@ -49,7 +48,7 @@ def judge_jaw_track(
     wrong poses, where it is larger, do not widen them much.
 
     Args:
-        path: see `jawusd.formats.face_track`.
+        path: see `jawusd.formats.alignment`.
         residual_mm, tolerance_mm: thresholds to widen; default: those of the rig.
 
     Raises:

@@ -30,8 +30,9 @@ from jawusd.fitting.data import (
     screened,
     select,
 )
-from jawusd.fitting.error_table import ErrorTable, seen_errors, unseen_errors
+from jawusd.fitting.error_table import seen_errors, unseen_errors
 from jawusd.formats.model import JawModel
+from jawusd.formats.notes import ErrorTable
 
 Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")

@@ -16,6 +16,8 @@ from jawusd.base.arrays import Array, Indices, Mask
 _RANK = 1e-9  # relative threshold below which singular values count as zero
 _TIE_DIGITS = 9
 _SAME_CENTRE = 1e-6  # normalised distance below which two points count as one centre
+_BLOCK, _FOLDS = 25, 5  # number of frames held out together (one second), and number of folds
+_CAP_MM = 1.0  # cap on the error of a held-out row, so that outliers do not determine the smoothness
 
 
 def farthest_points(points: Array, count: int) -> Array:
@@ -83,8 +85,13 @@ def within(residual_mm: Array, trim_mad: float, floor_mm: float) -> Mask:
     return residual_mm <= max(middle + trim_mad * spread, floor_mm)
 
 
+def folds_of(count: int) -> Indices:
+    """Return the fold number of each frame of a take, shape (count,); neighbouring frames are held out together."""
+    return np.arange(count) // _BLOCK % _FOLDS
+
+
 def choose_smoothing(
-    columns: Array, values: Array, weights: Array, energy: Array, tail: Array, grid: Array, folds: Indices, cap: float
+    columns: Array, values: Array, weights: Array, energy: Array, tail: Array, grid: Array, folds: Indices
 ) -> float:
     """Return the smoothing factor with the smallest capped error on held-out folds.
 
@@ -94,9 +101,7 @@ def choose_smoothing(
         energy: bending energy, shape (k, k).
         tail: constant part of the penalty, shape (k, k).
         grid: smoothing factors to try, ascending.
-        folds: fold number of each frame, shape (N,): contiguous blocks, since neighbouring frames are nearly equal;
-            rows with a negative fold number are never held out.
-        cap: cap on the error of a row [mm], so that outliers do not determine the smoothness.
+        folds: see `folds_of`, shape (N,); rows with a negative fold number are never held out.
     """
     weighted = columns * weights[:, None]
     total, right = weighted.T @ columns, weighted.T @ values
@@ -106,7 +111,7 @@ def choose_smoothing(
         normal, target = total - weighted[left].T @ columns[left], right - weighted[left].T @ values[left]
         for index, factor in enumerate(grid):
             predicted = columns[left] @ ridge_solve(normal, target, factor * energy + tail)
-            error = np.minimum(((values[left] - predicted) ** 2).sum(1), cap**2)
+            error = np.minimum(((values[left] - predicted) ** 2).sum(1), _CAP_MM**2)
             cost[index] += (weights[left] * error).sum()
     return float(grid[int(np.argmin(cost))])
 

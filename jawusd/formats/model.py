@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import cast
 
@@ -17,10 +18,25 @@ from numpy.typing import NDArray
 from jawusd.base.arrays import Array, Mask
 from jawusd.base.npz import TWIST_ORDER, UNITS, read_npz, take, upgraded_model
 from jawusd.formats.atomic import write_npz_atomic
-from jawusd.formats.notes import ModelMeta, check_notes
+from jawusd.formats.notes import ErrorTable, ModelMeta, check_notes
 
 FAMILY, VERSION = "jawusd-model", 2
 _CAPTURED = ("captured_frames", "captured_d", "captured_residual_mm", "captured_trained")
+
+
+def error_table(errors: Mapping[str, Array]) -> ErrorTable:
+    """Return mean, median, p95, max [mm] and count of errors (n,) [mm] by name; empty columns are omitted."""
+    return {
+        name: {
+            "mean": float(values.mean()),
+            "median": float(np.median(values)),
+            "p95": float(np.percentile(values, 95)),
+            "max": float(values.max()),
+            "frames": len(values),
+        }
+        for name, values in errors.items()
+        if len(values)
+    }
 
 
 @dataclass(eq=False)

@@ -27,9 +27,6 @@ T = TypeVar("T")
 #: Frame offset of a camera.
 Frames = Annotated[int, Field(ge=-10_000_000, le=10_000_000)]
 
-_Table = dict[str, dict[str, float]]
-_ByCamera = dict[str, list[float]]
-
 
 def read_toml(path: str | os.PathLike[str]) -> dict[str, object]:
     """Return the content of a TOML file.

@@ -32,6 +32,7 @@ _FROM_TRAGION_MM = np.array([-20.0, 0.0, 13.0])
 _MOLAR_BEHIND_INCISOR_MM = 25.0
 _MOLAR_ASIDE_MM = 22.0
 _MIDLINE_MM = 4.0  # lateral extent of the incisal edge on each side of the midline
+_THINNED = 3000  # number of points of an arch that are sufficient to find its axes
 _MIN_FRONT = 40  # minimum number of points on an incisal edge
 _MIN_SLABS = 4  # minimum number of coronal slabs with teeth on both sides to find the midline
 # Size of the cells in which heights of the dental arches are compared, and minimum number of cells that both arches
@@ -142,8 +143,8 @@ def _centre_midline(points: Array, R: Array) -> tuple[Array, float]:
     return R, float(midline)
 
 
-def _thin(points: Array, count: int = 3000) -> Array:
-    return points[:: max(1, len(points) // count)]
+def _thin(points: Array) -> Array:
+    return points[:: max(1, len(points) // _THINNED)]
 
 
 def _mirror_angle(flat: Array) -> float:

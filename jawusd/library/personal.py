@@ -20,6 +20,8 @@ import numpy as np
 from jawusd.base.arrays import Array
 from jawusd.base.errors import FittingError
 from jawusd.evaluator import JawRig
+from jawusd.formats.model import error_table
+from jawusd.formats.notes import ErrorTable
 from jawusd.geometry import LANDMARKS, landmark_frame, rigid_fit, transform_points
 
 
@@ -99,18 +101,9 @@ class Expected:
             "mean_by_person": {name: float(values.mean()) for name, values in self.errors_mm.items()},
         }
 
-    def table(self) -> dict[str, dict[str, float]]:
+    def table(self) -> ErrorTable:
         """Return mean, median, p95 and max of the errors per landmark [mm], in the form of a model's error tables."""
-        return {
-            name: {
-                "mean": float(column.mean()),
-                "median": float(np.median(column)),
-                "p95": float(np.percentile(column, 95)),
-                "max": float(column.max()),
-                "frames": len(column),
-            }
-            for name, column in zip(LANDMARKS, self.pooled().T, strict=True)
-        }
+        return error_table(dict(zip(LANDMARKS, self.pooled().T, strict=True)))
 
 
 @dataclass(frozen=True, eq=False)

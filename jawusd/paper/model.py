@@ -28,8 +28,9 @@ from jawusd.evaluator.models import AdditiveModel
 from jawusd.fitting import fit
 from jawusd.fitting.additive import MEASURED, Curve, in_millimetres
 from jawusd.fitting.data import FittedForm, TrainingData
-from jawusd.fitting.error_table import pose_errors, summarise
+from jawusd.fitting.error_table import pose_errors
 from jawusd.fitting.fit import FormFitter
+from jawusd.formats.model import error_table
 from jawusd.geometry import se3_exp, se3_log
 
 if TYPE_CHECKING:
@@ -147,7 +148,7 @@ def fit_paper(
         best = _with_leftovers(best, points, error)
     model, notes = _curves(best, points, root, data)
     notes |= {"groups": [list(part.group) for part in best.parts], "seed": best.seed, "components": COMPONENTS}
-    notes["train_errors_as_published"] = summarise(pose_errors(data, _rebuilt(best, data.motion, root)))
+    notes["train_errors_as_published"] = error_table(pose_errors(data, _rebuilt(best, data.motion, root)))
     return PaperFit(model, np.ones(len(data), dtype=bool), notes, best, root)
 
 

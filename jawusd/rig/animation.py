@@ -21,6 +21,7 @@ from jawusd.evaluator import JawRig
 from jawusd.geometry.se3 import make_transform
 from jawusd.geometry.so3 import so3_exp, wxyz_from_matrix
 from jawusd.rig import layers
+from jawusd.rig.attributes import MAX_FRAMES
 from jawusd.rig.layers import new_layer, relative_path, rename_actor, stage_of, write_layer
 from jawusd.rig.layout import ACTOR, MANDIBLE, MODEL_HASH_KEY, PARAMETERS, rig_prims
 from jawusd.rig.read import load_rig, open_stage
@@ -32,8 +33,7 @@ BETWEEN_MM = 0.02
 _FRACTIONS = (0.25, 0.5, 0.75)
 _MAX_HALVINGS = 5
 _USD_LERP_BELOW = 1e-5  # threshold of 1 - cosine below which GfSlerp interpolates linearly
-# Maximum number of baked frames, enough for an hour at 60 frames per second, and maximum absolute frame number.
-_MAX_FRAMES, _FARTHEST_FRAME = 220_000, 1e9
+_FARTHEST_FRAME = 1e9  # maximum absolute frame number
 #: Keys in an animation layer's `customLayerData`: frames without d, with d inferred from their neighbours, and with d
 #: estimated from facial skin.
 LOST = "lostFrames"
@@ -88,9 +88,9 @@ def write_animation(
         raise RigError("the frame numbers of an animation must increase.", path=out)
     if not fps > 0:
         raise RigError(f"the frame rate is {fps}; it must be greater than 0.", path=out)
-    if frames[-1] - frames[0] > _MAX_FRAMES or np.abs(frames).max() > _FARTHEST_FRAME:
+    if frames[-1] - frames[0] > MAX_FRAMES or np.abs(frames).max() > _FARTHEST_FRAME:
         raise RigError(
-            f"has frames {frames[0]:g} to {frames[-1]:g}; an animation may have at most {_MAX_FRAMES} frames within "
+            f"has frames {frames[0]:g} to {frames[-1]:g}; an animation may have at most {MAX_FRAMES} frames within "
             f"+-{_FARTHEST_FRAME:g}.",
             path=out,
         )

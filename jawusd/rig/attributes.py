@@ -115,7 +115,8 @@ def value_of(attribute: Usd.Attribute, where: object, time: Usd.TimeCode | None 
     return value
 
 
-MAX_FRAMES = 220_000  # maximum number of sample times: an hour at 60 frames per second, as for writing
+#: Maximum number of frames of a motion that is read or written, enough for an hour at 60 frames per second.
+MAX_FRAMES = 220_000
 
 
 def key_times(attribute: Usd.Attribute) -> list[float]:

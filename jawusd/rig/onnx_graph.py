@@ -91,9 +91,9 @@ class Graph:
         self.nodes.append(node)
         return self._found.setdefault(key, Value(self, output))
 
-    def concat(self, parts: Sequence[Value], *, axis: int = 1, name: str | None = None) -> Value:
-        """Return values joined along an axis."""
-        return self.op("Concat", *parts, axis=axis, name=name)
+    def concat(self, parts: Sequence[Value]) -> Value:
+        """Return values joined along axis 1."""
+        return self.op("Concat", *parts, axis=1)
 
     def parts(self, a: Value, count: int, *, axis: int = 1) -> list[Value]:
         """Split a value into equal parts along an axis."""

@@ -11,8 +11,7 @@ from run_jawusd import face_csv, run
 from jawusd.base.errors import FormatError
 from jawusd.fitting.align import align, rig_points
 from jawusd.fitting.face_judging import alignment_error_mm, judge_jaw_track
-from jawusd.formats.alignment import save_alignment
-from jawusd.formats.face_track import read_jaw_track
+from jawusd.formats.alignment import read_jaw_track, save_alignment
 from jawusd.geometry import make_transform, random_rotation, se3_inverse, so3_exp, so3_log, transform_points
 
 SIGMA = {"incisor": 0.8, "molar_left": 1.2, "molar_right": 1.2, "chin": 2.0, "condyle_left": 2.0, "condyle_right": 2.0}

@@ -133,7 +133,7 @@ def test_cross_validation_smooths_noise_and_keeps_signal(wave, noise, expected):
     grid = 10.0 ** np.arange(-6.0, 5.0)
     tail = 1e-9 * np.eye(len(basis.energy))
     folds = np.arange(200) // 20 % 5
-    chosen = choose_smoothing(basis.columns(q), values, np.ones(200), basis.energy, tail, grid, folds, 10.0)
+    chosen = choose_smoothing(basis.columns(q), values, np.ones(200), basis.energy, tail, grid, folds)
     assert (chosen >= 10) == (expected == "stiff")
 
 

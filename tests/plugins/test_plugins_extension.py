@@ -17,7 +17,7 @@ def test_zip_holds_manifest_modules_and_reader(tmp_path):
     assert first.read_bytes() == second.read_bytes()
     with zipfile.ZipFile(first) as archive:
         names = set(archive.namelist())
-        own = {f"{name}.py" for name in ("__init__", "bake", "handle", "jaw", "panel", "scene")}
+        own = {f"{name}.py" for name in ("__init__", "bake", "handle", "jaw", "panel")}
         own |= {"blender_manifest.toml", "vendored.py", "vendored_usd.py"}
         assert {name for name in names if "/" not in name} == own
         assert {"jawusd/evaluator/rig.py", "jawusd/rig/animation.py", "jawusd/plugins/jawusd_reader.py"} <= names
