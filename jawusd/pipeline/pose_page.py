@@ -39,6 +39,7 @@ def write_page(
     from jawusd.report.pose_page import PosePage, write_pose_page
     from jawusd.rig.read import describe
     from jawusd.rig.table import DEFAULT_SIZE, grid_axes, valid_box
+    from jawusd.viewer.readouts import GHOSTS, GHOSTS_APART_MM
     from jawusd.viewer.viewed import MOVING
 
     file = rig_file(path)
@@ -61,6 +62,7 @@ def write_page(
         take=np.zeros((0, 3)) if clip is None else clip.at(np.arange(clip.span[0], clip.span[1] + 1)),
         first=0 if clip is None else round(clip.span[0]),
         fps=actor.fps if clip is None else clip.fps,
+        ghosts=(GHOSTS, GHOSTS_APART_MM),
         teeth=ContactView(file, rig, str(describe(file, prim)["prim"])).teeth() if painted else None,
         footage=_footage(file.parent) if footage else None,
     )

@@ -90,7 +90,8 @@ def _deflated(values: NDArray[np.uint8] | NDArray[np.int16]) -> str:
     return base64.b64encode(zlib.compress(np.ascontiguousarray(values).tobytes(), 9)).decode("ascii")
 
 
-_SCRIPTS = ("scene.js", "decoder.js", "contacts.js", "drag.js", "keys.js", "timeline.js", "pose.js")
+_SCRIPTS = ("scene.js", "decoder.js", "contacts.js", "drag.js", "ghosts.js", "keys.js", "timeline.js", "pose.js")
+_MOST_CAPTURED = 1000
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,6 +114,7 @@ class PosePage:
     take: Array  # parameters of the take, frame by frame [mm], shape (F, 3); F = 0 without a take
     first: int  # first frame of the take
     fps: float  # frame rate of the take, and of keys
+    ghosts: tuple[int, float]  # number of captured poses that are shown near a pose, and their least distance in d [mm]
     teeth: Teeth | None = None  # both arches, whose contacts are painted; None without contacts
     footage: PageFootage | None = None
 
@@ -141,7 +143,8 @@ def pose_data(page: PosePage) -> dict[str, object]:
     """Return the input of pose.js, ready for JSON encoding.
 
     The table contains, for each grid point, the twist (omega [rad], v [mm]) of the motion relative to occlusion in the
-    anatomical frame, and the margin [mm]. The take contains d and the margin of every frame [mm].
+    anatomical frame, and the margin [mm]. The take contains d and the margin of every frame [mm]; the ghosts contain d
+    of captured poses [mm].
     """
     rig = page.rig
     d = np.stack(np.meshgrid(*page.axes, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -150,6 +153,7 @@ def pose_data(page: PosePage) -> dict[str, object]:
     low, high = vertices.min(0), vertices.max(0)
     landmarks = transform_points(rig.T_anatomical_skull @ rig.T_rest, rig.landmarks)
     clearance = rig.contact
+    captured = rig.captured_d[:: max(1, -(-len(rig.captured_d) // _MOST_CAPTURED))]
     return {
         "parts": [packed(part) for part in page.parts],
         "axes": [axis.round(6).tolist() for axis in page.axes],
@@ -159,6 +163,7 @@ def pose_data(page: PosePage) -> dict[str, object]:
         "fps": page.fps,
         "tolerance": rig.tolerance_mm,
         "traced": landmarks[list(TRACED)].round(3).tolist(),
+        "ghosts": {"captured": encoded(captured.astype("<f4")), "count": page.ghosts[0], "apart": page.ghosts[1]},
         "contact": None if clearance is None or page.teeth is None else contact_data(clearance, page.teeth),
         "footage": None if page.footage is None else _footage_data(page.footage),
         "centre": (0.5 * (low + high)).round(2).tolist(),

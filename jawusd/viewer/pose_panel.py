@@ -16,7 +16,7 @@ from jawusd.evaluator.contact import AUTHORED_MM
 from jawusd.formats.mesh import DEEP, TOUCHING
 from jawusd.geometry import LANDMARKS
 from jawusd.viewer.plots import GREEN, VERMILION
-from jawusd.viewer.readouts import Readout
+from jawusd.viewer.readouts import Readout, nearest_captured
 from jawusd.viewer.scene import PRESETS, JawScene
 from jawusd.viewer.session import Session
 from jawusd.viewer.widgets import Choice, add_dark_checkbox, assign, guarded, small_text
@@ -38,6 +38,7 @@ _MARGIN_HELP = "Distance in d from the pose to this subject's bound; negative ou
 _CAPTURED_HELP = "Distance in d to the nearest captured pose: the larger it is, the more the model extrapolates."
 _VALID_HELP = "Valid range of this parameter at the current values of the others."
 _MOVED_HELP = "Displacement from the closed bite, in anatomical axes: to the subject's left, down, forward."
+_GHOSTS_HELP = "Draw the captured poses that are nearest to this one, at least 1 mm apart in d, faintly."
 # Extension of the sliders beyond the rig's ranges if poses outside the bound are allowed, as a fraction of the range.
 _BEYOND = 0.25
 _PINNABLE = tuple(name for name in LANDMARKS if not name.startswith("molar"))
@@ -69,6 +70,8 @@ class PosePanel:
         with gui.add_folder("View"):
             gui.add_button_group("look from", tuple(PRESETS)).on_click(guarded(client, self._look))
             gui.add_checkbox("paths and captured positions", True).on_update(guarded(client, self._show_paths))
+            self.ghosts = gui.add_checkbox("nearest captured poses", False, hint=_GHOSTS_HELP)
+            self.ghosts.on_update(guarded(client, self._show_ghosts))
             add_dark_checkbox(client)
         gui.add_command("Undo", hotkey="Z", modifier="cmd/ctrl").on_trigger(guarded(client, self._undo))
         gui.add_command("Redo", hotkey="Z", modifier="cmd/ctrl+shift").on_trigger(guarded(client, self._redo))
@@ -117,6 +120,15 @@ class PosePanel:
     async def _look(self, event: Choice) -> None:
         self._scene.look(event.target.value)
 
+    async def _show_ghosts(self, _: object) -> None:
+        self._draw_ghosts()
+
+    def _draw_ghosts(self) -> None:
+        """Draw the captured poses nearest to the current one if they are switched on."""
+        rig, d = self._session.rig, self._session.d
+        near = nearest_captured(rig, d) if self.ghosts.value else np.zeros((0, 3))
+        self._scene.show_ghosts(rig.pose(near))
+
     async def _show_paths(self, event: viser.GuiEvent[viser.GuiCheckboxHandle]) -> None:
         self._scene.show_paths(event.target.value)
 
@@ -134,6 +146,8 @@ class PosePanel:
         for name, box in self.pins.items():
             assign(box, any(pin.name == name for pin in session.work.pins))
         self.reading.content = reading_html(readout, session.work.d, limits)
+        if self.ghosts.value:
+            self._draw_ghosts()
 
 
 def slider_ends(limits: Array, d_range: Array, keep_valid: bool) -> list[tuple[float, float]]:

@@ -13,6 +13,9 @@ from jawusd.geometry.se3 import transform_points
 
 INCISOR, CONDYLES = LANDMARKS.index("incisor"), (LANDMARKS.index("condyle_left"), LANDMARKS.index("condyle_right"))
 
+#: Number of captured poses that are shown near a pose, and their least distance from each other in d [mm].
+GHOSTS, GHOSTS_APART_MM = 3, 1.0
+
 
 @dataclass(frozen=True)
 class Readout:
@@ -64,6 +67,18 @@ def triple(values: Array) -> tuple[float, float, float]:
 def captured_d(rig: JawRig) -> Array:
     """Return the parameters of the captured poses stored in a rig [mm], shape (N, 3)."""
     return rig.captured_d
+
+
+def nearest_captured(rig: JawRig, d: Array) -> Array:
+    """Return captured poses near d (3,), nearest first, shape (n, 3) [mm], with n <= `GHOSTS`."""
+    captured = captured_d(rig)
+    found: list[Array] = []
+    for row in captured[np.argsort(np.linalg.norm(captured - d, axis=1), kind="stable")]:
+        if len(found) == GHOSTS:
+            break
+        if all(np.linalg.norm(row - other) >= GHOSTS_APART_MM for other in found):
+            found.append(row)
+    return np.array(found).reshape(-1, 3)
 
 
 def habitual_path(rig: JawRig, samples: int = 60) -> Array:

@@ -12,7 +12,7 @@ from jawusd.formats.mesh import Mesh
 from jawusd.geometry import LANDMARKS
 from jawusd.geometry.se3 import se3_inverse, transform_point, transform_points
 from jawusd.geometry.so3 import wxyz_from_matrix
-from jawusd.viewer.readouts import CONDYLES, INCISOR, captured_d, habitual_path, landmark_places, rest_places
+from jawusd.viewer.readouts import CONDYLES, GHOSTS, INCISOR, captured_d, habitual_path, landmark_places, rest_places
 from jawusd.viewer.viewed import MOVING, STILL, ViewedActor, is_solid
 
 Color = tuple[int, int, int]
@@ -23,7 +23,7 @@ _OUTSIDE: Color = (222, 120, 90)
 _PLACEHOLDER: Color = (150, 158, 168)  # colour of placeholders, distinct from bone
 _CLEAR = 0.45  # opacity of a translucent mandible
 _INCISOR, _CONDYLE, _PIN, _HELD = (0, 114, 178), (0, 158, 115), (230, 159, 0), (213, 94, 0)
-_SKULL_OPACITY = 0.28
+_SKULL_OPACITY, _FAINT = 0.28, 0.16
 _GROUND: Color = (196, 190, 186)
 _AMBIENT = 1.6
 _MARKER_MM, _PIN_MM = 1.2, 2.2
@@ -76,6 +76,8 @@ class JawScene:
                 self._add_mesh(f"/{name}", placed, color, _SKULL_OPACITY if name == "skull" else None)
         self._jaw = self._scene.add_frame("/jaw", show_axes=False)
         moving = [name for name in MOVING if name in actor.meshes]
+        self._moving = {name: actor.meshes[name] for name in moving}
+        self._ghosts: list[viser.FrameHandle] = []
         self._bone = _PLACEHOLDER if "mandible" in actor.placeholders else _BONE
         self.grips = []
         for name in moving:
@@ -144,6 +146,25 @@ class JawScene:
         """Show or hide the paths and the captured positions."""
         for handle in self._paths:
             handle.visible = visible
+
+    def show_ghosts(self, T_skull_mandible: Array) -> None:
+        """Draw the lower teeth and the mandible faintly at poses (n, 4, 4), n <= `GHOSTS`; n = 0 hides them."""
+        if len(T_skull_mandible) and not self._ghosts:
+            self._ghosts = [self._add_ghost(f"/ghost_{k}") for k in range(GHOSTS)]
+        for k, ghost in enumerate(self._ghosts):
+            visible = k < len(T_skull_mandible)
+            if visible:
+                T = self._T_world_skull @ T_skull_mandible[k]
+                ghost.position, ghost.wxyz = tuple(T[:3, 3]), tuple(wxyz_from_matrix(T[:3, :3]))
+            if ghost.visible != visible:
+                ghost.visible = visible
+
+    def _add_ghost(self, name: str) -> viser.FrameHandle:
+        ghost = self._scene.add_frame(name, show_axes=False)
+        for part in ("mandible", "lower_teeth"):
+            if part in self._moving:
+                self._add_mesh(f"{name}/{part}", self._moving[part], _COLORS.get(part, self._bone), _FAINT)
+        return ghost
 
     def move(self, T_skull_mandible: Array, inside: bool) -> None:
         """Pose the mandible; colour it if the pose is invalid."""

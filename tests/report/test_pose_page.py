@@ -21,6 +21,7 @@ from jawusd.geometry.se3 import transform_points
 from jawusd.pipeline.pose_page import write_page
 from jawusd.rig.layout import EXAMPLE_RIG
 from jawusd.rig.read import load_rig
+from jawusd.viewer.readouts import GHOSTS, nearest_captured
 
 chromium = pytest.fixture(headless_chromium, scope="module")
 WANTED = {40: (0, 0, 0), 80: (22, 0, 0), 90: (25, 1, 2), 140: (6, -3, 1)}  # frames of keys, and their poses [mm]
@@ -313,6 +314,20 @@ def test_parts_are_shown_and_hidden(jaw, part):
     assert (np.abs(picture(jaw) - shown).sum(axis=2) > 30).sum() > 30
     box.check()
     np.testing.assert_array_equal(picture(jaw), shown)
+
+
+def test_the_nearest_captured_poses_are_drawn_faintly(jaw, rig):
+    jaw.set_pose((14, 0, 0))
+    shown = picture(jaw)
+    jaw.part("ghosts").check()
+    near = json.loads(jaw.web.locator("#jaw").get_attribute("data-ghosts"))
+    np.testing.assert_allclose(near, nearest_captured(rig, jaw.pose()[0]), atol=1e-4)
+    assert len(near) == GHOSTS
+    changed = np.abs(picture(jaw) - shown).sum(axis=2)
+    assert (changed > 20).sum() > 300 and np.median(changed[changed > 20]) < 150  # teeth stay visible behind them
+    jaw.part("ghosts").uncheck()
+    np.testing.assert_array_equal(picture(jaw), shown)
+    assert jaw.web.locator("#jaw").get_attribute("data-ghosts") == "[]"
 
 
 def test_on_a_phone_the_take_plays_and_the_timeline_is_in_reach(chromium, file):

@@ -16,7 +16,15 @@ from jawusd.pipeline.state import BuildState
 from jawusd.pipeline.view import open_viewer
 from jawusd.rig.motion_read import read_poses_of_stage
 from jawusd.viewer.page import FREE_DEPTH
-from jawusd.viewer.readouts import CONDYLES, INCISOR, landmark_places, rest_places
+from jawusd.viewer.readouts import (
+    CONDYLES,
+    GHOSTS,
+    GHOSTS_APART_MM,
+    INCISOR,
+    landmark_places,
+    nearest_captured,
+    rest_places,
+)
 from jawusd.viewer.scene import PRESETS, preset_view
 
 
@@ -315,6 +323,26 @@ def test_errors_nobody_thought_of_are_messages_too(quiet):
     quiet.page.session.set_parameter = broken
     quiet.enter(quiet.page.pose.sliders[0], 3.0)
     assert quiet.notices[-1] == ("Unexpected error", "ZeroDivisionError: by nothing")
+
+
+def test_the_nearest_captured_poses_follow_the_jaw(quiet):
+    pose, scene, rig = quiet.page.pose, quiet.page.scene, quiet.page.session.rig
+    assert scene._ghosts == []  # nothing is sent before they are switched on
+    quiet.enter(pose.sliders[0], 12.0)
+    quiet.enter(pose.ghosts, True)
+    for opening in (12.0, 25.0):
+        quiet.enter(pose.sliders[0], opening)
+        d = quiet.page.session.d
+        near = nearest_captured(rig, d)
+        far = np.linalg.norm(rig.captured_d - d, axis=1)
+        assert np.linalg.norm(near[0] - d) == far.min() and len(near) == len(scene._ghosts) == GHOSTS
+        apart = np.linalg.norm(near[:, None] - near, axis=2)[np.triu_indices(GHOSTS, 1)]
+        assert (apart >= GHOSTS_APART_MM).all()
+        places = (rig.T_anatomical_skull @ rig.pose(near))[:, :3, 3]
+        np.testing.assert_allclose([ghost.position for ghost in scene._ghosts], places, atol=1e-6)
+        assert all(ghost.visible for ghost in scene._ghosts)
+    quiet.enter(pose.ghosts, False)
+    assert not any(ghost.visible for ghost in scene._ghosts)
 
 
 def test_two_pages_do_not_mix(viewer):

@@ -84,10 +84,13 @@
 
   // -- showing a pose ------------------------------------------------------------------------------------------------
   let now = [0, 0, 0], frame = span[0], running = false, started = 0, from = 0, held = null;
+  const nearest = makeGhosts(data.ghosts), ghosts = find("ghosts");
   const draw = () => {
-    const m = decoder.motion(now);
-    scene?.draw(new Float32Array(m), find("paths").checked ? paths() : []);
+    const m = decoder.motion(now), near = ghosts.checked ? nearest(now) : [];
+    const faint = near.map((d) => new Float32Array(decoder.motion(d)));
+    scene?.draw(new Float32Array(m), find("paths").checked ? paths() : [], faint);
     drawSection();
+    box.dataset.ghosts = JSON.stringify(near);
     box.dataset.d = JSON.stringify(now);
     box.dataset.motion = JSON.stringify(m);
   };
@@ -231,7 +234,8 @@
   });
   connectView(box, canvas, scene, draw);
   connectParts(box, scene, draw);
-  find("paths").addEventListener("change", draw);
+  for (const input of [find("paths"), ghosts]) input.addEventListener("change", draw);
+  ghosts.parentElement.hidden = !data.ghosts.captured;
   find("contacts")?.addEventListener("change", () => {
     if (scene) scene.painted = find("contacts").checked;
     draw();

@@ -5,6 +5,7 @@ const within = (x, low, high) => Math.min(Math.max(x, low), high);
 
 // Return a scene drawn on a canvas. `data` has parts, centre and radius; `draw(body, lines)` draws the moving parts at a
 // column-major 4 x 4 motion (null hides them) and polylines, flat arrays of x, y, z. A part with `hidden` is not drawn.
+// `ghosts`, optional, are further motions at which the moving teeth and bone are drawn faintly.
 const makeScene = (canvas, data) => {
   const gl = canvas.getContext("webgl2", { antialias: true });
   if (!gl) return null;
@@ -160,7 +161,21 @@ const makeScene = (canvas, data) => {
     gl.uniform3fv(at.size, field.size);
     gl.uniform2fv(at.scale, field.scale);
   };
-  const draw = (body, lines) => {
+  const GHOST = 0.16; // opacity
+  const drawPart = (part, body, alpha) => {
+    gl.uniformMatrix4fv(at.body, false, part.moves ? body : identity);
+    gl.uniform4f(at.color, ...colors[part.kind], alpha);
+    gl.uniform1f(at.behind, BEHIND[part.kind]);
+    gl.bindVertexArray(part.array);
+    gl.drawElements(gl.TRIANGLES, part.faces.length, gl.UNSIGNED_SHORT, 0);
+  };
+  const drawGhosts = (ghosts) => {
+    gl.uniform1f(at.painted, 0);
+    gl.depthMask(false);
+    for (const ghost of ghosts)
+      for (const part of parts) if (part.moves && !part.hidden && part.kind !== "gum") drawPart(part, ghost, GHOST);
+  };
+  const draw = (body, lines, ghosts = []) => {
     const width = Math.round(canvas.clientWidth * devicePixelRatio);
     const height = Math.round(canvas.clientHeight * devicePixelRatio);
     if (canvas.width !== width || canvas.height !== height) [canvas.width, canvas.height] = [width, height];
@@ -176,15 +191,12 @@ const makeScene = (canvas, data) => {
       for (const part of parts) {
         if ((part.name === "skull") !== glassy || (part.moves && !body) || part.hidden) continue;
         useField(part, body);
-        gl.uniformMatrix4fv(at.body, false, part.moves ? body : identity);
-        gl.uniform4f(at.color, ...colors[part.kind], glassy ? 0.3 : 1);
-        gl.uniform1f(at.behind, BEHIND[part.kind]);
         gl.depthMask(!glassy);
-        gl.bindVertexArray(part.array);
-        gl.drawElements(gl.TRIANGLES, part.faces.length, gl.UNSIGNED_SHORT, 0);
+        drawPart(part, body, glassy ? 0.3 : 1);
       }
       if (!glassy) for (const line of lines) drawLine(line, [0.84, 0.37, 0]);
     }
+    drawGhosts(ghosts);
     gl.depthMask(true);
   };
 
