@@ -2,7 +2,8 @@
 
 Usage: python tests/interop/make_environments.py FOLDER [NAME ...]
 Then run the tests with JAWUSD_INTEROP=FOLDER. Without names, all are installed: 3 GB, of which each Blender takes 1 GB,
-in about five minutes. An environment that fails or takes too long is skipped and named, and the exit code is 1.
+in about five minutes, with the pip of the Python that runs this (22.3 or newer). An environment that
+fails or takes too long is skipped and named, and the exit code is 1.
 """
 
 import shutil
