@@ -169,7 +169,7 @@ class Follower:
         self._wanted = set(np.linspace(frames.start, frames.stop - 1, _SAMPLED_VIEWS).astype(int).tolist())
         begin = self._begin
         take.follow(begin)
-        take.recover(again)
+        take.recover(again, begin.follow, lambda found: found.fit)
         for frame, least_mm in take.unconfirmed(begin.follow).items():
             take.known[frame] = take.known[frame].unconfirmed(least_mm, points[0])
         return dict(take.known)

@@ -13,6 +13,9 @@ from jawusd.base.errors import TrackingError
 
 _SHORTEST_LOSS = 3  # minimum number of successive lost frames in which the teeth are searched for
 _SAME_MM = 0.15  # distance of lower teeth below which two poses of a frame count as equal
+# Distance of lower teeth above which two poses of a frame contradict one another, since they match different contours:
+# in blurred images of fast jaws, correct poses were up to 0.6 mm apart.
+_OTHER_MM = 1.0
 # Second difference of the motion of lower teeth above which earlier frames are followed again [mm]. Speech and chewing
 # reach 1 mm at 24 fps; a false positive costs the time of one frame.
 _JUMP_MM = 0.8
@@ -88,13 +91,21 @@ class TwoWays(Generic[P]):
                 before = range(frame - way.step, begin.frame, -way.step)
                 self.replace(before, begin.follow(before, self.known[frame]))
 
-    def recover(self, search: Callable[[range, P], Begin[P]]) -> None:
+    def recover(
+        self,
+        search: Callable[[range, P], Begin[P]],
+        follow: Callable[[range, P], Iterator[P]] | None = None,
+        fit: Callable[[P], float] | None = None,
+    ) -> None:
         """Search where the teeth were lost for several frames; without any found poses, nothing is done.
 
         What is found is followed both ways, and discarded if it contradicts known poses and agrees with none.
 
         Args:
             search: searches in lost frames, given the nearest found pose. Raises TrackingError if it finds nothing.
+            follow: as in `Begin`, with colours that were learned in a good frame of the take. With it, lost frames are
+                followed once more from where the teeth were found, since such frames are often blurred or dark.
+            fit: measure by which the better of both poses is chosen, comparable between colours; `fit_px` by default.
         """
         if not any(pose.found.all() for pose in self.known.values()):
             return
@@ -109,6 +120,9 @@ class TwoWays(Generic[P]):
             if not begin.pose.found.all() or not self._joined(begin):
                 self.known = before
                 vain.update(lost)
+            elif follow is not None:
+                for way in both_ways(begin.frame, self.frames):
+                    self.replace(way, follow(way, begin.pose), lost, fit)
 
     def _joined(self, begin: Begin[P]) -> bool:
         """Follow from a frame in both directions, and replace poses; return whether these agree with trusted ones."""
@@ -117,7 +131,13 @@ class TwoWays(Generic[P]):
         meetings = [self.replace(way, begin.follow(way, begin.pose)) for way in ways]
         return False not in meetings or True in meetings
 
-    def replace(self, way: range, followed: Iterator[P], doubted: Container[int] = ()) -> bool | None:
+    def replace(
+        self,
+        way: range,
+        followed: Iterator[P],
+        doubted: Container[int] = (),
+        fit: Callable[[P], float] | None = None,
+    ) -> bool | None:
         """Replace poses by others of the same frames, as long as the two differ and the latter are better.
 
         A pose that is trusted is replaced if the other fits better, an uncertain one keeps the better fit of both.
@@ -126,12 +146,13 @@ class TwoWays(Generic[P]):
             way: frames in tracking order.
             followed: other poses of these frames.
             doubted: frames whose poses are not trusted.
+            fit: measure of the better pose; `fit_px` by default.
 
         Returns:
-            True if an equal trusted pose was met, False if a different one that fits better, None if an arch was lost
-            and no other one gained, or the take ended.
+            True if a trusted pose was met that is equal, or differs little and fits better; False if a different one
+            fits better; None if an arch was lost and no other one gained, or the take ended.
         """
-        misses = 0
+        misses, fit = 0, fit or self.fit_px
         for frame, other in zip(way, followed, strict=False):
             old = self.known[frame]
             if not other.found.all() and not gained(other, old):
@@ -141,11 +162,10 @@ class TwoWays(Generic[P]):
                 continue
             misses = 0
             if trust(old) == 2 and frame not in doubted:
-                if self._apart_mm(other, old) < _SAME_MM:
-                    return True
-                if self.fit_px(other) <= self.margin * self.fit_px(old):
-                    return False
-            self.known[frame] = max(other, old, key=lambda pose: (pose.found.sum(), self.fit_px(pose)))
+                apart_mm = self._apart_mm(other, old)
+                if apart_mm < _SAME_MM or fit(other) <= self.margin * fit(old):
+                    return apart_mm < _OTHER_MM
+            self.known[frame] = max(other, old, key=lambda pose: (pose.found.sum(), fit(pose)))
         return None
 
     def unconfirmed(self, follow: Callable[[range, P], Iterator[P]]) -> dict[int, float]:

@@ -5,14 +5,14 @@
 
 CAPTURE has truth/truth.npz; with --footage its masks are ignored, with --without-picks its picks. --cameras leaves out
 all others; --turn turns images by counter-clockwise quarter turns, as if these cameras had been mounted so; --noise
-replaces the images of these frames, the last one excluded, by noise, and does not count them as lost. Every run is a
-process of its own. The first is the capture as it is; the others change one thing each, in turn:
+replaces images and masks of these frames, the last one excluded, by noise, and does not count them as lost. Every run
+is a process of its own. The first is the capture as it is; the others change one thing each, in turn:
 
     1e-9, 1e-3, 0.1, 0.3 px   picks moved by normal noise of that size
     grey                      a grey level of noise, -1, 0 or 1, in the videos (masks stay)
     order                     cameras in reverse order
     reversed                  videos and masks played backwards (masks must be videos)
-    first                     the first frame left out
+    first                     the first frame left out, or the last one if picks are on the first one
     thread                    one thread instead of three
     generic                   compiled for a processor without vector units
 
@@ -34,6 +34,7 @@ from fractions import Fraction
 from pathlib import Path
 
 import av
+import cv2
 import numpy as np
 
 from jawusd.cameras.calibration import save_calibration
@@ -47,6 +48,7 @@ from jawusd.pipeline.track import track
 
 KINDS = ("1e-9 px", "1e-3 px", "0.1 px", "0.3 px", "grey", "order", "reversed", "first", "thread", "generic")
 WRONG_MM, SURE_MM = 1.0, 0.5
+ROWS = ("upper", "lower")
 
 
 def moved_picks(picks: Bootstrap, sigma_px: float, rng: np.random.Generator) -> Bootstrap:
@@ -141,16 +143,40 @@ def mounted(capture: Capture, names: Sequence[str], turns: Mapping[str, int], fo
 
 
 def interrupted(capture: Capture, frames: range, folder: Path) -> Capture:
-    """Return a capture whose videos show noise on some frames."""
+    """Return a capture whose videos and masks show noise on some frames."""
     offsets, cameras = sync_cameras(capture, lambda *_: None)["offsets"], []
     for camera in capture.cameras:
-        video, shift = folder / f"{camera.name}_noise.mkv", offsets[camera.name]
-        rewritten(camera.video, video, hidden=range(frames.start - shift, frames.stop - shift))
-        cameras.append(camera.model_copy(update={"video": video}))
+        shift, changed = offsets[camera.name], {}
+        hidden = range(frames.start - shift, frames.stop - shift)
+        if camera.video:
+            changed["video"] = folder / f"{camera.name}_noise.mkv"
+            rewritten(camera.video, changed["video"], hidden=hidden)
+        if camera.masks:
+            noisy = {row: noisy_masks(getattr(camera.masks, row), hidden, folder, camera.name + row) for row in ROWS}
+            changed["masks"] = camera.masks.model_copy(update=noisy)
+        cameras.append(camera.model_copy(update=changed))
     sync = capture.sync.model_copy(
         update={"method": "offsets", "offsets": offsets, "reference": capture.sync.reference or capture.cameras[0].name}
     )
     return capture.model_copy(update={"cameras": tuple(cameras), "sync": sync})
+
+
+def noisy_masks(masks: Path, hidden: range, folder: Path, name: str) -> Path:
+    """Write masks with noise instead of some frames: a video, or files with numbers; return their path."""
+    if "%" not in masks.name:
+        rewritten(masks, folder / f"{name}.mkv", hidden=hidden)
+        return folder / f"{name}.mkv"
+    target = folder / name / masks.name
+    target.parent.mkdir()
+    for path in masks.parent.glob(f"*{masks.suffix}"):
+        (target.parent / path.name).symlink_to(path)
+    for index in hidden:
+        place = target.parent / (masks.name % index)
+        if place.exists():
+            shape = cv2.imread(str(place), cv2.IMREAD_UNCHANGED).shape[:2]
+            place.unlink()
+            cv2.imwrite(str(place), np.random.default_rng(index).integers(0, 2, shape, dtype=np.uint8) * 255)
+    return target
 
 
 def backwards(capture: Capture, folder: Path) -> Capture:
@@ -162,7 +188,7 @@ def backwards(capture: Capture, folder: Path) -> Capture:
         files = {name: folder / f"{camera.name}_{name}.mkv" for name in clips}
         for name, path in clips.items():
             counts[camera.name] = rewritten(path, files[name], True, None)
-        masks = camera.masks and camera.masks.model_copy(update={k: files[k] for k in ("upper", "lower")})
+        masks = camera.masks and camera.masks.model_copy(update={k: files[k] for k in ROWS})
         cameras.append(camera.model_copy(update={"video": files.get("video"), "masks": masks}))
     reference = capture.sync.reference or capture.cameras[0].name
     last = counts[reference] - 1
@@ -194,7 +220,9 @@ def changed(capture: Capture, kind: str, folder: Path, rng: np.random.Generator)
         sync = capture.sync.model_copy(update={"reference": reference})
         return capture.model_copy(update={"cameras": capture.cameras[::-1], "sync": sync})
     if kind == "first" and capture.frames:
-        return capture.model_copy(update={"frames": (capture.frames[0] + 1, capture.frames[1])})
+        first, stop = capture.frames
+        picked = capture.bootstrap is not None and capture.bootstrap.frame == first
+        return capture.model_copy(update={"frames": (first, stop - 1) if picked else (first + 1, stop)})
     return backwards(capture, folder) if kind == "reversed" else capture
 
 

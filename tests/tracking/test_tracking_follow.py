@@ -101,6 +101,27 @@ def test_what_a_search_finds_is_discarded_if_it_only_contradicts(other, kept):
     assert kept or values(known) == before
 
 
+@pytest.mark.parametrize(("apart_mm", "kept"), [(0.5, True), (1.5, False)])
+def test_what_a_search_finds_is_kept_if_it_differs_little_from_known_poses(apart_mm, kept):
+    known = take([14, 15, 16])
+    tracker = Tracker({frame: Pose(frame + apart_mm) for frame in (13, 17)})
+    known.recover(lambda lost, near: Begin(15, Pose(15.0), tracker))
+    assert (lost_stretches(known.known, FRAMES) == []) is kept
+    assert (known.known[13].value, known.known[17].value) == (13.0, 17.0)
+
+
+@pytest.mark.parametrize("own", [0.5, 1.5])
+def test_frames_found_by_a_search_are_followed_with_the_colours_of_the_take_too(own):
+    """Lost in 14 to 16, found in 15; `own` is the fit with the colours of the take, 1 with those of frame 15."""
+    known = take([14, 15, 16])
+    begin = Begin(15, Pose(15.0), Tracker({frame: Pose(frame + 0.1, fit=1.0) for frame in (14, 16)}))
+    follow = Tracker({frame: Pose(frame - 0.1, fit=own) for frame in (14, 16)})
+    known.fit_px = lambda pose: 1.0
+    known.recover(lambda lost, near: begin, follow, lambda pose: pose.fit)
+    off_mm = 0.1 if own < 1.0 else -0.1
+    assert [known.known[frame].value for frame in range(13, 18)] == [13.0, 14 + off_mm, 15.0, 16 + off_mm, 17.0]
+
+
 def test_equal_poses_end_a_replacement():
     known = take([20, 21, 22])
     assert replaced(known, {frame: Pose(float(frame)) for frame in range(20, 28)}) is True

@@ -57,6 +57,11 @@ class RegionPose:
         """Whether less of the contour fits than usual, so that the poses may be wrong."""
         return bool((self.usual < _UNCERTAIN).any())
 
+    @property
+    def fit(self) -> float:
+        """Matched fraction of the visible contour, 0 .. 1; the smaller value of both arches."""
+        return 0.0 if self.solution is None else float(fitting_share(self.solution).min())
+
     def unconfirmed(self, least_mm: float, incisor: Array) -> RegionPose:
         """Return the poses with a standard deviation of at least `least_mm` at a point of the lower teeth, (3,)."""
         between = relative_covariance(self.poses[0], *self.covariance)
