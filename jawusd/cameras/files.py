@@ -70,7 +70,7 @@ def plain_name(name: str) -> str:
 
 
 def names_of_labels(path: Path, labels: Sequence[str]) -> list[str]:
-    """Return a unique name for each image label, without folder and suffix where it is unique without them.
+    """Return a unique name for each image label, without folder or suffix where it is unique without them.
 
     Raises:
         CalibrationError: two labels are equal.

@@ -170,7 +170,7 @@ def _camera(path: Path, name: str, parts: Mapping[str, Array], sizes: Mapping[st
     lacking = [role for role in ("K", "R", "T") if role not in parts]
     if lacking:
         raise CalibrationError(
-            f"camera {name} has no {lacking[0]}.", path=path, hint="Both pose (R, T) and intrinsics (K, D) are needed."
+            f"camera {name} has no {lacking[0]}.", path=path, hint="Both pose (R, T) and camera matrix (K) are needed."
         )
     if "width" in parts and "height" in parts:
         sides = np.array([parts["width"], parts["height"]], np.float64).ravel()

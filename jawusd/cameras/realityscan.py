@@ -55,8 +55,8 @@ def load_realityscan_xmp(folder: Path, sizes: Mapping[str, Size]) -> list[Camera
         sizes: (width, height) [px] of the images by camera.
 
     Raises:
-        CalibrationError: a size is unknown, or a value is missing or wrong.
-        FormatError: a file is damaged.
+        CalibrationError: a file is not XML, a size is unknown, or a value is missing or wrong.
+        FormatError: a file cannot be read.
     """
     out = []
     for path in files_in(folder, ".xmp"):

@@ -18,8 +18,8 @@ from jawusd.media.clip import INTERLACED, INTERLACED_HINT
 MOST_VIEWS = 80  # maximum number of views in a calibration; more views would not increase the accuracy
 _LOOKED_AT = 6  # number of images that are searched for a board different from [boards]
 _PER_WINDOW = 2  # number of consecutive video frames of which the sharpest is used
-# Ratio of an image's 10 to 90 % edge width to the camera's median above which the image is blurred; the resulting limit
-# is clamped to a range.
+# An image is blurred if its 10 to 90 % edge width exceeds the camera's median by this factor; the limit is clamped to a
+# range.
 _BLUR_RATIO, _BLUR_LIMITS_PX = 1.5, (4.0, 8.0)
 
 

@@ -160,7 +160,7 @@ class RigAuthoring(RigArrays):
 
         Returns:
             The limits [mm]; NaN where no value is valid. The bound ends a few tenths of a mm inside ``d_range[0]``;
-            beyond its ends, the limits at the nearest valid opening are returned.
+            for openings between the two, the limits at the nearest valid opening are returned.
         """
         each = (as_floats(x, name) for x, name in ((d1, "d1"), (d2, "d2"), (d3, "d3")))
         d = np.stack(np.broadcast_arrays(*each), axis=-1)

@@ -14,7 +14,7 @@ that limit. The arrays of the file, for M training frames, K columns, C componen
     features (M, C), d (M, 3)    training frames: components over scale, and d [mm]
     noise (M,)                   variance of each training frame, relative to that of d
     kernel (4,)                  length, smooth, linear, and the variance of a new frame that skin does not explain
-    spread (3, 3)                covariance of d per unit of variance of the process [mm^2]
+    spread (3, 3)                covariance of d per unit of variance of the Gaussian process [mm^2]
     head_error (R, C)            change of the features by one sigma of each shift and rotation of the head
     smooth_count (), familiar_count ()    number of components in the smooth part, and in the test of familiarity
     familiar_limit (2,)          largest variance, and largest squared distance from the components, of a familiar face
@@ -140,7 +140,7 @@ class Skin:
         return str(self.meta.get("actor") or "")
 
     def _predicted(self, X: Array) -> Array:
-        """Return d, covariance, variance of the process and squared distance from the components, shape (n, 14)."""
+        """Return d, its covariance, the variance of the process, and the squared distance from the components' span."""
         features, kernel = self.arrays["features"], self.arrays["kernel"]
         f, left_out = components(X, self.arrays["mean"], self.arrays["basis"], float(self.arrays["scale"]))
         smooth, linear = skin_kernel(f, features, kernel, self._smooth)

@@ -31,12 +31,8 @@ _LEAST_FRAMES, _FRAMES = 60, 300  # minimum number of frames with visible teeth,
 _BLOCKS = 6  # number of contiguous blocks that are held out in turn
 _COMPONENTS, _SMOOTH, _INSIDE = 120, 14, 30  # numbers of components: all, smooth part, familiarity test
 _LEAST_MOVED_MM = 0.5  # minimum standard deviation of each parameter in the training frames; 12 subjects have 1.4 mm
-_START = (
-    2.0,
-    3.0,
-    0.3,
-    0.001,
-)  # initial kernel (typical of fitted ones): length, smooth part, linear part, noise
+# Initial parameters of the kernel, typical of fitted ones: length, smooth part, linear part, noise.
+_START = (2.0, 3.0, 0.3, 0.001)
 _LOW, _HIGH = np.log([0.2, 0.01, 0.001, 1e-5]), np.log([20.0, 100.0, 100.0, 3.0])
 _STEPS, _MOST_TRIALS = np.log([3.0, 1.7]), 80
 _FALSE_ALARMS = 0.01  # fraction of held-out frames that are flagged as unfamiliar

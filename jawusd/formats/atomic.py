@@ -42,7 +42,7 @@ def destination(path: str | os.PathLike[str]) -> Path:
             target = Path(os.path.realpath(target))
             if not target.is_relative_to(os.path.realpath(Path(path).parent)):
                 hint = "Delete the link, or name the file itself."
-                raise OutputError(f"is a link out of its folder, to {target}.", path=path, hint=hint)
+                raise OutputError(f"is a link that leads out of its folder, to {target}.", path=path, hint=hint)
         found = _mode(target)
     except (OSError, ValueError) as error:  # the name is too long or contains a null byte, or links are circular
         raise OutputError(f"cannot write here: {getattr(error, 'strerror', error)}.", path=path) from error

@@ -213,7 +213,7 @@ class Boards(Strict):
             lacking = [key for key in ("dictionary", "marker_mm") if getattr(self, key) is None]
             raise ValueError(
                 f'pattern = "charuco" also needs {" and ".join(lacking)}. '
-                'For example: dictionary = "DICT_5X5_100" (as printed) and marker_mm = 6.0 (side of a marker)'
+                'For example: dictionary = "DICT_5X5_100" (as on the board) and marker_mm = 6.0 (side of a marker)'
             )
         if self.marker_mm is not None and self.marker_mm >= self.square_mm:
             raise ValueError(

@@ -88,7 +88,7 @@ def triangulate(projections: ArrayLike, pixels: ArrayLike) -> Array:
     """
     M, x = np.asarray(projections, dtype=np.float64), np.asarray(pixels, dtype=np.float64)
     if M.ndim != 3 or M.shape[1:] != (3, 4) or x.shape != (len(M), 2) or len(M) < 2:
-        raise ValueError(f"expected projections (C >= 2, 3, 4) and pixels (C, 2), got {M.shape} and {x.shape}")
+        raise ValueError(f"expected projections (C, 3, 4) with C >= 2 and pixels (C, 2), got {M.shape} and {x.shape}")
     rows = (x[:, :, None] * M[:, None, 2, :] - M[:, :2, :]).reshape(-1, 4)
     rows = rows / np.linalg.norm(rows, axis=1, keepdims=True)
     X = np.linalg.svd(rows)[2][-1]

@@ -72,7 +72,8 @@ def _grid(times_s: Array, fps: float) -> tuple[NDArray[np.int64], float]:
     steps = np.diff(times_s)
     if len(steps) < 2 or not (median := float(np.median(steps))) > 0:
         return np.arange(len(times_s)), fps
-    # Use the mean over adjacent frames: gaps would bias the mean of all, and rounded time stamps would bias the median.
+    # Use the mean interval between adjacent frames: gaps would bias the mean of all intervals, and rounded time stamps
+    # would bias the median.
     period = float(steps[(steps > 0.5 * median) & (steps < 1.5 * median)].mean())
     last = 16  # jitter causes an error of a few per mille, so refine the period on growing intervals
     while True:

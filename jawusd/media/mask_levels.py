@@ -28,8 +28,8 @@ _FLAT = 10  # Maximum difference [of 255] between adjacent pixels inside a regio
 _ALIKE = 0.15  # maximum difference of one level between images of a source, as a fraction of the contrast
 # Maximum flat area of a third level relative to that of the second-largest level; soft edges have no flat area.
 _MOST_THIRD = 0.25
-# Minimum fraction of a third gray level's pixels that lie within 1 of its value for the level to count as a label;
-# photographs stay below it.
+# A third gray level counts as a label if at least this fraction of its pixels lie within 1 of its value; the fraction
+# is smaller in photographs.
 _SHARP = 0.8
 
 

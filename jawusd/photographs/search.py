@@ -239,7 +239,7 @@ def find_first(drawing: Drawing, scans: Sequence[Scan], usual: Sequence[TypicalB
 
 
 def _slid(bite: Bite, rows: ArchPair, aligner: Aligner) -> list[Bite]:
-    """Return copies of a photograph: one with its current bite, and one with each of the best shifted bites."""
+    """Return the given bite and the best of the shifted ones."""
     axes = rows.usual.T_anatomical_upper[:3, :3]
     out = []
     for slide in product(_ASIDE_MM, _UP_MM, _AHEAD_MM):

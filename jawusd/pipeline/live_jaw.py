@@ -180,7 +180,8 @@ class FaceStream:
         """Prepare to read from the file, pipe or standard input named by `options.face`.
 
         Raises:
-            FormatError: there is no such file, or the points are not relative to the head.
+            FormatError: there is no such file, or `options.rigid` is given, although a live face must already be
+                relative to the head.
         """
         if options.rigid:
             raise FormatError("is read while it is written; --rigid applies to recorded faces only.", path=options.face)

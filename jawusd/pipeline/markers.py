@@ -82,7 +82,7 @@ def in_head(
         FormatError: a rigid body other than the head is given, or the head does not fit the markers.
     """
     if set(rigid) != {"head"}:
-        raise FormatError(f"rigid bodies given: {', '.join(rigid)}; only head is used.", path=path)
+        raise FormatError(f'rigid bodies given: {", ".join(rigid)}; only "head" is allowed.', path=path)
     T = _moved("head", read_body(rigid["head"]), points, names, rest_frame, LENGTH_UNITS_MM[unit], path)
     return transform_points(se3_inverse(T), points)
 

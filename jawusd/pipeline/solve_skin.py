@@ -81,10 +81,10 @@ class SkinOfShot:
         found = self._skin(columns_at(self._face_s + self._known_offset(), self._columns, times))
         if not found.familiar.any():
             raise FittingError(
-                f"{os.fspath(self._face)}: the face resembles those from which the map was learned in none of the "
-                f"{len(frames)} frames.",
-                hint="Check that face and map have the same unit (--length-unit), that points are relative to the same "
-                "head (--rigid), and the offset of the clocks (--offset).",
+                f"{os.fspath(self._face)}: in none of the {len(frames)} frames does the face resemble those from "
+                "which the map was learned.",
+                hint="Check the units of face and map (--length-unit), the rigid body of the head (--rigid) and the "
+                "offset of the clocks (--offset).",
             )
         self.unfamiliar = frames[np.isfinite(found.d).all(axis=1) & ~found.familiar].astype(np.int64)
         rows = seen & found.familiar

@@ -179,7 +179,7 @@ def _read(path: Path) -> dict[str, StageRecord[Mapping[str, object]]]:
 def _record(found: Mapping[str, object]) -> StageRecord[Mapping[str, object]]:
     inputs, outputs, seconds, result = (found[name] for name in ("inputs", "outputs", "seconds", "result"))
     if not (isinstance(inputs, str) and isinstance(outputs, dict) and isinstance(result, dict)):
-        raise ValueError("inputs must be text; outputs and result must be tables")
+        raise ValueError("inputs must be text; outputs and result must be JSON objects")
     for name, value in outputs.items():
         place = PurePosixPath(name)
         if place.is_absolute() or ".." in place.parts or not _SHA256.fullmatch(str(value)):

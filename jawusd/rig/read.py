@@ -161,7 +161,10 @@ def read_table(prim: Usd.Prim, where: object) -> DecoderTable:
     twists = _numbers(prim, "jaw:decoder:twists", where).astype(np.float32)
     shape = (*counts, 6) if stored_as == "grid" else (sum(counts), 6)
     if twists.size != math.prod(shape):
-        raise FormatError(f"jaw:decoder:twists has {twists.size} numbers; expected {shape}.", path=str(where))
+        raise FormatError(
+            f"jaw:decoder:twists has {twists.size} numbers; expected {math.prod(shape)}, of shape {shape}.",
+            path=str(where),
+        )
     if not np.isfinite(twists).all() or not all(np.isfinite(axis).all() for axis in axes):
         raise FormatError("jaw:decoder has values that are not finite.", path=str(where))
     error_mm, samples = (_numbers(prim, f"jaw:decoder:{name}", where) for name in ("maxError", "errorSamples"))

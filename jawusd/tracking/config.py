@@ -85,8 +85,8 @@ class TrackingConfig:
     tile_factor: float = 2.2
     # Number of recent good frames that define the usual residual and coverage: about a second.
     history_frames: int = 31
-    # Number of recent good frames that define the usual score: fewer frames than lips need to close, and more than it
-    # takes to lose a pose.
+    # Number of recent good frames that define the usual score: shorter than the time in which lips close, and longer
+    # than that in which a pose is lost.
     score_frames: int = 7
     # Fraction of the recent median score below which the pose of an arch is suspect [-]: closing lips seldom hide so
     # much of an arch in a few frames.

@@ -103,7 +103,7 @@ def test_an_interrupt_leaves_no_process_and_no_half_file(shoot, tmp_path, monkey
     (tmp_path / "list.txt").write_text(f"{shoot / 'take'}\n")
     (tmp_path / "scratch").mkdir()
     monkeypatch.setenv("TMPDIR", str(tmp_path / "scratch"))
-    process = started(tmp_path)
+    process = started(tmp_path, "--workers", "1")
     worker_on(process, tmp_path / "out" / "take")
     children = psutil.Process(process.pid).children(recursive=True)
     send(process.pid, number)

@@ -82,7 +82,7 @@ def test_points_of_a_c3d_are_given_relative_to_the_head(take, tmp_path):
     assert face.fps == 60 and face.names[-1] == "HF"
     np.testing.assert_allclose(face.X[:, :-3], transform_points(T[0], X), atol=0.02)
     np.testing.assert_allclose(read_face(tmp_path / "face.c3d").X[:, :-3], transform_points(T, X), atol=0.02)
-    with pytest.raises(FormatError, match="only head is used"):
+    with pytest.raises(FormatError, match='only "head" is allowed'):
         read_face(tmp_path / "face.c3d", rigid={"jaw": "HL,HR,HF"}, rest_frame=0)
 
 

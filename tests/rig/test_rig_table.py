@@ -62,7 +62,7 @@ def test_parameters_outside_are_clamped_and_nan_gives_nan():
     table = DecoderTable("grid", knots, twists)
     corner = np.array([[k[-1] for k in knots]])
     np.testing.assert_array_equal(table.pose(corner + 50.0, RIG.T_rest), table.pose(corner, RIG.T_rest))
-    assert np.isnan(table.pose([[np.nan, 0.0, 0.0]], RIG.T_rest)).any()
+    assert np.isnan(table.pose([[np.nan, 0.0, 0.0]], RIG.T_rest)[:, :3]).all()
     assert np.isnan(table.twist([[np.nan, 0.0, 0.0], [0.0, np.inf, 0.0]])).all()
     assert table.pose(np.empty((0, 3)), RIG.T_rest).shape == (0, 4, 4)
 

@@ -42,9 +42,10 @@ class Magnification:
             expected.
         bend, sigma_bend: change of `scale` from the optical axis to a radius of 25 mm at the teeth, shape (C,).
         bias_px, sigma_bias_px: outward mask bias at working resolution, per arch, shape (C, 2).
-        turn_rad, move_mm: angle of rotation and distance of motion of each camera relative to the mean of all, shape
+        turn_rad, move_mm: angle of rotation and distance of translation of each camera relative to the mean of all,
+            shape (C,).
+        motion_clear: significance of rotation and translation together, in standard deviations (Mahalanobis), shape
             (C,).
-        motion_clear: significance of rotation and motion together, in standard deviations (Mahalanobis), shape (C,).
         spread_px: robust standard deviation of the residuals.
     """
 

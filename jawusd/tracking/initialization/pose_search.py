@@ -35,7 +35,7 @@ class Grid:
 
     Attributes:
         yaw_rad, pitch_rad, roll_rad: rotations about the up, left and front axes of the arch.
-        reach_mm: maximum translation along left, up and front, in both directions.
+        reach_mm: maximum translation along the left, up and front axes, in both directions.
         step_mm: spacing of the translations.
     """
 
@@ -53,7 +53,7 @@ class Grid:
                 yield so3_exp([0, yaw, 0]) @ so3_exp([pitch, 0, 0]) @ rolls
 
     def shifts(self) -> Array:
-        """Return the translations along left, up and front [mm], shape (N, 3)."""
+        """Return the translations to the left, up and forward [mm], shape (N, 3)."""
         axes = [np.arange(-r, r + self.step_mm / 2, self.step_mm) for r in self.reach_mm]
         return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
 

@@ -145,7 +145,7 @@ class PoseSearch:
         self._bite, self._axes = BiteTerm(landmarks[:3], axes[1], BORDER_PX3), axes
 
     def near(self, start: Array, look: InstantViews, *, firm: bool = False) -> Solution:
-        """Align from a start accurate to a few tenths of a millimetre, T_world_upper and T_world_lower (2, 4, 4).
+        """Align from T_world_upper and T_world_lower (2, 4, 4) that are accurate to a few tenths of a millimetre.
 
         Args:
             firm: whether the condylar prior has a high weight, for uncertain frames.

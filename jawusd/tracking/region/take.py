@@ -35,7 +35,8 @@ _LEAST_SHARE = 0.3  # matched fraction of a camera's contour, relative to the be
 # Standard deviation of the position of the lower teeth above which a frame is uninformative [mm]; and fractions of such
 # frames above which a take is partly unreliable, and above which it is unusable.
 _UNKNOWN_MM, _FEW, _MANY = 1.0, 0.03, 0.2
-_MOST = 0.6  # minimum length of a run of good frames, as a fraction of the take, for suggesting to trim the take's ends
+# Minimum length of a run of good frames, as a fraction of the take, at which trimming its ends is suggested.
+_MOST = 0.6
 
 #: Prior on the offsets between colour borders and tooth edges. Borders lie up to half a pixel inside the edges, since
 #: teeth darken towards them; gum-line offsets are learned while tracking.
