@@ -14,7 +14,7 @@ from jawusd.base.errors import FormatError, naming_file
 from jawusd.base.inputs import check_input
 from jawusd.cli.options import USD_SUFFIXES
 from jawusd.cli.output import emit
-from jawusd.evaluator.authoring import monotone_tangents
+from jawusd.evaluator.authoring import smooth_tangents
 from jawusd.evaluator.clamping import Inside
 from jawusd.evaluator.curves import HermiteCurve
 from jawusd.formats.keys import FARTHEST_FRAME, FARTHEST_MM, MOST_FRAMES, Key, Keys, load_keys
@@ -79,14 +79,25 @@ def _read_motion(rig: JawRig, source: Path) -> AuthoredMotion:
         )
     if source.suffix.lower() == ".json" and source.read_bytes().lstrip()[:1] == b"{":
         keys = load_keys(source)
-        key_frames, key_d = keys.arrays()
+        key_frames, _ = keys.arrays()
         at = np.unique(np.concatenate([np.arange(np.ceil(key_frames[0]), np.floor(key_frames[-1]) + 1), key_frames]))
-        d = rig.interpolate(key_frames, key_d, at, method=keys.interpolation, inside=False)
+        d = curve_at(rig, keys, at)
         return AuthoredMotion(at, d, keys.fps, keys)
     frames, d = read_poses_or_parameters(source)
     if d.ndim > 2:
         d, _ = rig.encode(d)
     return AuthoredMotion(frames.astype(np.float64), d, None)
+
+
+def curve_at(rig: JawRig, keys: Keys, at: Array) -> Array:
+    """Return d (n, 3) [mm] of the curve through keys at frames (n,), which may leave the bound."""
+    return rig.interpolate(*keys.arrays(), at, keys.interpolation, inside=False, tangents=keys.tangents())
+
+
+def _retimed(key: Key, ratio: float) -> Key:
+    """Return a key with its frame multiplied by a ratio, and its slopes per frame divided by it."""
+    slopes = key.tangents and tuple(None if slope is None else slope / ratio for slope in key.tangents)
+    return key.model_copy(update={"frame": key.frame * ratio, "tangents": slopes})
 
 
 def read_pose_table(path: Path) -> tuple[NDArray[np.int64], Array]:
@@ -133,7 +144,7 @@ def kept_inside(rig: JawRig, motion: AuthoredMotion) -> tuple[AuthoredMotion, Ch
         keys = motion.keys
         inside = rig.keep_inside(motion.frames[known], wanted)
     else:
-        curve = rig.interpolate(*keys.arrays(), motion.frames, method="smooth", inside=False)
+        curve = curve_at(rig, keys, motion.frames)
         inside = Inside(motion.frames, curve, np.ones(len(curve), dtype=bool))
     moved_mm = np.linalg.norm(inside.d[inside.given] - wanted, axis=1)
     outside = ~rig.is_inside(wanted)
@@ -163,10 +174,12 @@ def _valid_keys(rig: JawRig, motion: AuthoredMotion) -> Keys | None:
     inside = rig.keep_inside(frames, d)
     d = inside.d[inside.given]
     fine = np.linspace(frames[0], frames[-1], int(_FINE * (frames[-1] - frames[0])) + 1)
-    if not rig.is_inside(rig.interpolate(frames, d, fine, method="smooth", inside=False)).all():
-        return None
-    keys = tuple(Key(frame=frame, d=tuple(row)) for frame, row in zip(frames.tolist(), d.tolist(), strict=True))
-    return motion.keys.model_copy(update={"keys": keys})
+    keys = tuple(
+        Key(frame=key.frame, d=tuple(row), tangents=key.tangents)
+        for key, row in zip(motion.keys.keys, d.tolist(), strict=True)
+    )
+    valid = motion.keys.model_copy(update={"keys": keys})
+    return valid if rig.is_inside(curve_at(rig, valid, fine)).all() else None
 
 
 class Knots(NamedTuple):
@@ -186,15 +199,15 @@ def knots_of(rig: JawRig, motion: AuthoredMotion) -> Knots:
         return Knots(frames, d, np.zeros_like(d), np.zeros(max(len(d) - 1, 0), dtype=bool))
     key_frames, key_d = motion.keys.arrays()
     smooth = motion.keys.interpolation == "smooth"
-    slopes = monotone_tangents(key_frames, key_d) if smooth else np.zeros_like(key_d)
+    slopes = smooth_tangents(key_frames, key_d, motion.keys.tangents()) if smooth else np.zeros_like(key_d)
     keep, tangents = np.isin(frames, key_frames), np.zeros_like(d)
     tangents[keep] = slopes
-    own = np.abs(rig.interpolate(key_frames, key_d, frames, motion.keys.interpolation, inside=False) - d) <= _MOVED_MM
+    own = np.abs(curve_at(rig, motion.keys, frames) - d) <= _MOVED_MM
     places = np.flatnonzero(keep)
     cubic = np.zeros(len(d), dtype=bool)
     for start, end in zip(places, places[1:]):
         between = np.linspace(frames[start], frames[end], 10 * int(frames[end] - frames[start] + 1))
-        curve = rig.interpolate(key_frames, key_d, between, motion.keys.interpolation, inside=False)
+        curve = curve_at(rig, motion.keys, between)
         if own[start : end + 1].all() and rig.is_inside(curve).all():
             cubic[start] = smooth
         else:
@@ -206,12 +219,11 @@ def follow_curves(rig: JawRig, motion: AuthoredMotion, knots: Knots) -> Authored
     """Return the motion, with samples added where linear interpolation deviates from the curves through its keys."""
     if motion.keys is None or not knots.curved.any():
         return motion
-    key_frames, key_d = motion.keys.arrays()
     frames, d = motion.frames, motion.d
     for _ in range(_MOST_HALVINGS):
         middle = 0.5 * (frames[1:] + frames[:-1])
         piece = np.clip(np.searchsorted(knots.frames, middle) - 1, 0, len(knots.curved) - 1)
-        curve = rig.interpolate(key_frames, key_d, middle, motion.keys.interpolation, inside=False)
+        curve = curve_at(rig, motion.keys, middle)
         off = np.linalg.norm(curve - 0.5 * (d[1:] + d[:-1]), axis=1) > _OFF_CURVE_MM
         where = np.flatnonzero(off & knots.curved[piece]) + 1
         frames, d = np.insert(frames, where, middle[where - 1]), np.insert(d, where, curve[where - 1], axis=0)
@@ -286,10 +298,10 @@ def resampled(rig: JawRig, motion: AuthoredMotion, source_fps: float, fps: float
     if not len(at):
         at = np.round(times[:1])
     if motion.keys is not None:
-        keys = tuple(Key(frame=key.frame * ratio, d=key.d) for key in motion.keys.keys)
+        keys = tuple(_retimed(key, ratio) for key in motion.keys.keys)
         moved = motion.keys.model_copy(update={"keys": keys, "fps": fps})
         at = np.union1d(at, [key.frame for key in keys])
-        d = rig.interpolate(*moved.arrays(), at, method=moved.interpolation, inside=False)
+        d = curve_at(rig, moved, at)
         return AuthoredMotion(at, d, fps, moved)
     known = np.asarray(np.isfinite(motion.d).all(axis=1))
     seen, values = times[known], motion.d[known]

@@ -29,10 +29,13 @@ _CHECK_SHARES = 0.5 - 0.5 * np.cos(np.linspace(0.0, np.pi, 1025))
 _ROUNDING_MM = 1e-9
 
 
-def interpolated(frames: Array, keys: Array, at: Array, method: str, bound: SliceHull | None) -> Array:
+def interpolated(
+    frames: Array, keys: Array, at: Array, method: str, bound: SliceHull | None, tangents: Array | None = None
+) -> Array:
     """Return d (m, 3) [mm] at times ``at`` between keys (k, 3), "linear" or "smooth"; constant outside the keys.
 
     Args:
+        tangents: See `smooth_tangents`; lines do not use them.
         bound: Smooth segments between two valid keys that would leave this bound follow it instead.
 
     Raises:
@@ -41,7 +44,7 @@ def interpolated(frames: Array, keys: Array, at: Array, method: str, bound: Slic
     if method == "linear":
         return interpolate_linear(frames, keys, at)
     if method == "smooth":
-        return interpolate_smooth(frames, keys, at, bound)
+        return interpolate_smooth(frames, keys, at, bound, tangents)
     raise ValueError(f'method must be "linear" or "smooth", got {method!r}')
 
 
@@ -50,14 +53,17 @@ def interpolate_linear(frames: Array, keys: Array, at: Array) -> Array:
     return np.stack([np.interp(at, frames, column) for column in keys.T], axis=1)
 
 
-def interpolate_smooth(frames: Array, keys: Array, at: Array, bound: SliceHull | None) -> Array:
-    """Return d (m, 3) [mm] at times ``at`` on a monotone C1 curve through the keys (k, 3); constant outside the keys.
+def interpolate_smooth(
+    frames: Array, keys: Array, at: Array, bound: SliceHull | None, tangents: Array | None = None
+) -> Array:
+    """Return d (m, 3) [mm] at times ``at`` on a C1 curve through the keys (k, 3); constant outside the keys.
 
-    A segment between valid keys that would leave the bound follows it instead, and is then only continuous.
+    The curve is monotone between keys without given tangents. A segment between valid keys that would leave the bound
+    follows it instead, and is then only continuous.
     """
     if len(keys) == 1:
         return np.broadcast_to(keys, (len(at), 3)).copy()
-    curve = HermiteCurve(frames, keys, monotone_tangents(frames, keys))
+    curve = HermiteCurve(frames, keys, smooth_tangents(frames, keys, tangents))
     at = np.clip(at, frames[0], frames[-1])
     d = curve.value(at)
     if bound is None:
@@ -74,6 +80,12 @@ def interpolate_smooth(frames: Array, keys: Array, at: Array, bound: SliceHull |
                 kept = kept_inside(bound, times, wanted, ends_stay=True)
                 d[queried] = interpolate_linear(kept.times, kept.d, at[queried])
     return d
+
+
+def smooth_tangents(frames: Array, keys: Array, given: Array | None = None) -> Array:
+    """Return the tangents (k, 3) [mm per frame] of the smooth curve: those given, monotone ones where these are NaN."""
+    monotone = monotone_tangents(frames, keys)
+    return monotone if given is None else np.where(np.isnan(given), monotone, given)
 
 
 def monotone_tangents(frames: Array, keys: Array) -> Array:
@@ -108,6 +120,7 @@ class RigAuthoring(RigArrays):
         method: Literal["linear", "smooth"] = "linear",
         *,
         inside: bool = True,
+        tangents: ArrayLike | None = None,
     ) -> Array:
         """Return jaw parameters between keys.
 
@@ -116,6 +129,8 @@ class RigAuthoring(RigArrays):
             d_keys: Jaw parameters [mm] at the keys, shape (K, 3).
             at: Query times, any shape; before the first key and after the last one, d is constant.
             method: "linear" for straight lines in d as in the paper, or "smooth" for a C1 curve, monotone between keys.
+            tangents: Slopes of the smooth curve at the keys [mm per unit of time], shape (K, 3); NaN and None: those
+                with which it is monotone between keys. Lines do not use them.
             inside: Where the smooth curve between two valid keys would leave the bound, follow the bound instead; the
                 curve is then only continuous. See `keep_inside` for keys outside the bound.
 
@@ -123,11 +138,15 @@ class RigAuthoring(RigArrays):
             Jaw parameters [mm], shape (*at.shape, 3).
 
         Raises:
-            ValueError: wrong shapes, keys that are not finite, frames that do not increase, or an unknown method.
+            ValueError: wrong shapes, keys that are not finite, infinite tangents, frames that do not increase, or an
+                unknown method.
         """
         frames, keys = as_keys(frames, d_keys)
         times, batch = as_rows(as_floats(at, "at")[..., None], (1,), "at")
-        d = interpolated(frames, keys, times[:, 0], method, self.bound if inside else None)
+        slopes = None if tangents is None else np.array(tangents, dtype=np.float64)
+        if slopes is not None and (slopes.shape != keys.shape or np.isinf(slopes).any()):
+            raise ValueError(f"tangents must have shape {keys.shape} and no infinite entry, got shape {slopes.shape}")
+        d = interpolated(frames, keys, times[:, 0], method, self.bound if inside else None, slopes)
         return d.reshape(*batch, 3)
 
     def keep_inside(self, times: ArrayLike, d: ArrayLike) -> Inside:

@@ -27,7 +27,7 @@ _Parameter = Annotated[float, Field(allow_inf_nan=False, ge=-FARTHEST_MM, le=FAR
 
 
 class Key(BaseModel):
-    """Animation key: the jaw parameters d [mm] at one frame."""
+    """Animation key: the jaw parameters d [mm] at one frame, and optionally their slopes."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -35,6 +35,11 @@ class Key(BaseModel):
     d: tuple[_Parameter, _Parameter, _Parameter] = Field(
         description="three numbers: d1, d2, d3 (opening, laterotrusion, protrusion) [mm], "
         f"each within +-{FARTHEST_MM:g}"
+    )
+    tangents: tuple[_Parameter | None, _Parameter | None, _Parameter | None] | None = Field(
+        None,
+        description="three numbers: slopes of d1, d2, d3 at the key [mm per frame], used by smooth interpolation; null "
+        "and without this entry: the slope with which the curve is monotone between keys",
     )
 
 
@@ -62,6 +67,10 @@ class Keys(BaseModel):
         """Return the key frames (K,) and their jaw parameters d [mm] (K, 3)."""
         return np.array([key.frame for key in self.keys]), np.array([key.d for key in self.keys])
 
+    def tangents(self) -> Array:
+        """Return the slopes of d at the keys [mm per frame] (K, 3); NaN where they are not given."""
+        return np.array([[np.nan] * 3 if key.tangents is None else key.tangents for key in self.keys], dtype=np.float64)
+
 
 def load_keys(path: str | os.PathLike[str]) -> Keys:
     """Read animation keys.
@@ -79,4 +88,4 @@ def save_keys(path: str | os.PathLike[str], keys: Keys) -> None:
     Raises:
         OutputError: the file cannot be written.
     """
-    write_text_atomic(path, json.dumps(keys.model_dump(mode="json"), indent=1) + "\n")
+    write_text_atomic(path, json.dumps(keys.model_dump(mode="json", exclude_none=True), indent=1) + "\n")

@@ -82,7 +82,9 @@ def at_frames(keys: KeyTrack, frames: Sequence[float]) -> KeyTrack:
     """
     if len(frames) != len(keys) or len(set(frames)) != len(keys):
         raise FormatError(f"{len(keys)} keys at {len(set(frames))} different frames; every key needs its own frame.")
-    return tuple(Key(frame=float(frame), d=key.d) for key, frame in zip(keys, sorted(frames), strict=True))
+    return tuple(
+        key.model_copy(update={"frame": float(frame)}) for key, frame in zip(keys, sorted(frames), strict=True)
+    )
 
 
 def frame_after(frame: float, elapsed_s: float, fps: float, span: tuple[float, float], loop: bool) -> float | None:

@@ -252,7 +252,7 @@ class Session:
     def _clip_of(self, saved: Keys) -> Clip:
         frames, d_keys = saved.arrays()
         times = np.union1d(np.arange(np.ceil(frames[0]), np.floor(frames[-1]) + 1), frames)
-        d = self.rig.interpolate(frames, d_keys, times, saved.interpolation, inside=False)
+        d = self.rig.interpolate(frames, d_keys, times, saved.interpolation, inside=False, tangents=saved.tangents())
         if self.keep_valid:
             times, d, _ = self.rig.keep_inside(times, d)
         return Clip("keys", times, d, saved.fps)

@@ -10,6 +10,7 @@ from example_rig import FPS, example_motion, mandible_vertices, moved
 from key_sets import own_curve
 from pxr import Usd, UsdGeom
 from run_jawusd import run
+from scipy.interpolate import CubicHermiteSpline
 
 import jawusd
 from jawusd.formats.poses import write_parameters
@@ -128,6 +129,23 @@ def test_keys_move_to_another_rate_and_keep_their_curves(actor, tmp_path):
     stage = Usd.Stage.Open(str(splines))
     knots = stage.GetPrimAtPath("/Actor").GetAttribute("jaw:d1").GetSpline().GetKnots()
     assert sorted(knots.keys()) == [12, 24, 36]
+
+
+def test_given_tangents_are_those_of_the_motion_at_any_rate(actor, tmp_path):
+    d = [[2, 0, 0], [12, 0.5, 0], [8, 0, 0]]
+    keys = [{"frame": frame, "d": row} for frame, row in zip((0, 20, 40), d)]
+    keys[1]["tangents"] = [0.4, None, None]
+    (tmp_path / "keys.json").write_text(json.dumps({"fps": 48, "interpolation": "smooth", "keys": keys}))
+    oracle = CubicHermiteSpline([0, 20, 40], [row[0] for row in d], [0, 0.4, 0])
+    for rate, step in ((48, 1), (24, 2)):
+        splines, out = tmp_path / f"splines_{rate}.usda", tmp_path / f"anim_{rate}.usdc"
+        run("animate", actor, tmp_path / "keys.json", "-o", out, "--splines", splines, "--resample", str(rate))
+        times = np.arange(0, 40 // step + 1)
+        sampled, keyed = (Usd.Stage.Open(str(path)) for path in (out, splines))
+        found = [sampled.GetPrimAtPath("/Actor").GetAttribute("jaw:d1").Get(float(time)) for time in times]
+        np.testing.assert_allclose(found, oracle(times * step), atol=1e-4)
+        spline = keyed.GetPrimAtPath("/Actor").GetAttribute("jaw:d1").GetSpline()
+        assert spline.GetKnot(20 / step).GetPostTanSlope() == pytest.approx(0.4 * step)
 
 
 def test_keys_outside_come_inside_and_keep_their_tangents(actor, tmp_path):

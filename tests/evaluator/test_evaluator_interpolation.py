@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from example_model import example_arrays, example_meta
-from scipy.interpolate import PchipInterpolator, interp1d
+from scipy.interpolate import CubicHermiteSpline, PchipInterpolator, interp1d
 
 from jawusd.evaluator import JawRig
 
@@ -48,6 +48,32 @@ def test_smooth_is_scipys_monotone_curve():
         for inside in (False, True):
             found = RIG.interpolate(frames, keys, at, "smooth", inside=inside)
             np.testing.assert_allclose(found, oracle(at), atol=1e-10)
+
+
+def test_given_tangents_are_those_of_the_curve_and_others_stay_monotone():
+    frames, keys = keys_inside(6, 3, spread=0.5)
+    given = np.full((6, 3), np.nan)
+    given[2], given[4, 1], given[0, 2] = (0.5, -0.8, 0.0), 0.3, 1.0
+    at = np.linspace(frames[0], frames[-1], 2001)
+    plain = RIG.interpolate(frames, keys, at, "smooth", inside=False)
+    bent = RIG.interpolate(frames, keys, at, "smooth", inside=False, tangents=given)
+    for axis in range(3):
+        held = np.concatenate([[frames[0] - 1], frames, [frames[-1] + 1]])
+        slopes = PchipInterpolator(held, np.pad(keys[:, axis], 1, mode="edge")).derivative()(frames)
+        known = np.isfinite(given[:, axis])
+        slopes[known] = given[known, axis]
+        oracle = CubicHermiteSpline(frames, keys[:, axis], slopes)
+        np.testing.assert_allclose(bent[:, axis], oracle(at), atol=1e-9)
+    assert np.abs(bent - plain).max() > 0.2
+    unbent = RIG.interpolate(frames, keys, at, "smooth", inside=False, tangents=np.full((6, 3), np.nan))
+    np.testing.assert_array_equal(unbent, plain)
+    lines = RIG.interpolate(frames, keys, at, tangents=given)
+    np.testing.assert_array_equal(lines, RIG.interpolate(frames, keys, at))
+    inside = RIG.interpolate(frames, keys, at, "smooth", tangents=10 * given)
+    assert RIG.margin(inside).min() > -1e-8  # the bound also holds curves with given tangents
+    for wrong in (given[:-1], np.where(np.isnan(given), np.inf, given)):
+        with pytest.raises(ValueError, match="tangents must have shape"):
+            RIG.interpolate(frames, keys, at, "smooth", tangents=wrong)
 
 
 def test_smooth_holds_and_never_overshoots():

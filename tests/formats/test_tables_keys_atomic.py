@@ -76,6 +76,11 @@ def test_keys_round_trip_and_faults(tmp_path):
     assert load_keys(tmp_path / "k.json") == keys
     frames, d = keys.arrays()
     assert frames.tolist() == [0, 12] and d.shape == (2, 3)
+    assert "tangents" not in (tmp_path / "k.json").read_text() and np.isnan(keys.tangents()).all()
+    bent = keys.model_copy(update={"keys": (keys.keys[0], Key(frame=12, d=(20, 1, 2), tangents=(0.5, None, -1)))})
+    save_keys(tmp_path / "k.json", bent)
+    assert load_keys(tmp_path / "k.json") == bent
+    np.testing.assert_array_equal(bent.tangents(), [[np.nan] * 3, [0.5, np.nan, -1]])
     for text, words in [
         ('{"fps": 24, "keys": []}', "keys"),
         ('{"fps": 24, "keys": [{"frame": 1, "d": [0,0,0]}, {"frame": 1, "d": [0,0,0]}]}', "must increase"),
@@ -86,7 +91,9 @@ def test_keys_round_trip_and_faults(tmp_path):
         ('{"fps": 24, "keys": [{"frame": 1}]}', "keys, entry 1: d needs three numbers"),
         ('{"fps": 24, "keys": [{"frame": 1, "d": [0,0,0]}, {"frame": 2, "d": [0,"x",0]}]}', 'entry 2: d needs .*"x"'),
         ('{"fps": 24, "keys": [{"d": [0,0,0]}]}', "keys, entry 1: frame needs a number"),
-        ('{"fps": 24, "keys": [{"frame": 1, "d": [0,0,0], "D": 1}]}', 'unknown key "D"; allowed keys: frame, d'),
+        ('{"fps": 24, "keys": [{"frame": 1, "d": [0,0,0], "D": 1}]}', 'unknown key "D"; allowed keys: frame, d, tan'),
+        ('{"fps": 24, "keys": [{"frame": 1, "d": [0,0,0], "tangents": [1, 2]}]}', "1: tangents needs three numbers"),
+        ('{"fps": 24, "keys": [{"frame": 1, "d": [0,0,0], "tangents": [1, null, "x"]}]}', "tangents needs three"),
         ('{"fps": 24, "keys": [7]}', "keys: entry 1 needs a JSON object, found 7"),
         ('{"fps": "fast", "keys": []}', 'fps needs a number above 0, at most 10000 .1/s., found "fast"'),
         ("[]", "the file needs a JSON object"),

@@ -161,7 +161,8 @@ def off_mm(rig, d, motion):
 def interpolated(keys, frames):
     """Return the evaluator's smooth curve through the keys of the page at frames, shape (n, 3) [mm]."""
     times, d = np.array([key["frame"] for key in keys], float), np.array([key["d"] for key in keys])
-    return interpolate_smooth(times, d, np.array(frames, float), None)
+    given = np.array([key.get("tangents", [None] * 3) for key in keys], float)
+    return interpolate_smooth(times, d, np.array(frames, float), None, given)
 
 
 @pytest.mark.parametrize(
@@ -242,6 +243,47 @@ def test_a_key_dragged_past_another_does_not_replace_it(keyed):
     start = keyed.place(80)
     keyed.pull((start[0], start[1] + 29), keyed.place(90)[0] - start[0], 0)  # its diamond, below ruler and strip
     assert len(keyed.read_keys()) == len(WANTED) and keyed.read_keys()[1]["frame"] in (89, 88)
+
+
+def handle(jaw, key, slope, side=1, length_px=44):
+    """Return the place in the page [px] of the handle of d1 at a key, given the slope of the curve there."""
+    (x, y), area = jaw.place(key["frame"], key["d"][0]), jaw.area()
+    across = (area["right"] - area["left"]) / (area["view"][1] - area["view"][0])
+    up = (area["top"] - area["bottom"]) / (area["range"][1] - area["range"][0])
+    scale = side * length_px / np.hypot(across, slope * up)
+    return x + scale * across, y + scale * slope * up
+
+
+def test_a_handle_bends_the_curve_as_the_evaluator_does_and_is_stored(keyed, tmp_path):
+    before = keyed.read_keys()
+    keyed.seek(80)
+    slope = (interpolated(before, [80.001]) - interpolated(before, [79.999]))[0, 0] / 0.002
+    start = handle(keyed, before[1], slope)
+    keyed.pull(start, 0, 30)
+    bent = keyed.read_keys()
+    assert [key["d"] for key in bent] == [key["d"] for key in before] and bent[0::2] == before[0::2]
+    assert bent[1]["tangents"][1:] == [None, None] and bent[1]["tangents"][0] < slope - 0.1
+    frames = [70, 79, 85]
+    for frame, d in zip(frames, interpolated(bent, frames), strict=True):
+        keyed.seek(frame)
+        np.testing.assert_allclose(keyed.pose()[0], d, atol=1e-6)
+    assert np.abs(interpolated(bent, frames) - interpolated(before, frames)).max() > 0.1
+    with keyed.web.expect_download() as loading:
+        keyed.part("json").click()
+    loading.value.save_as(tmp_path / "keys.json")
+    assert load_keys(tmp_path / "keys.json").keys[1].tangents == tuple(bent[1]["tangents"])
+    keyed.web.keyboard.press("Control+z")
+    assert keyed.read_keys() == before
+    keyed.web.keyboard.press("Control+Shift+z")
+    keyed.seek(80)
+    keyed.web.mouse.dblclick(*handle(keyed, bent[1], bent[1]["tangents"][0]))  # lets the curve be monotone again
+    assert keyed.read_keys() == before
+    keyed.web.keyboard.press("Control+z")
+    assert keyed.read_keys() == bent
+    keyed.part("smooth").uncheck()  # lines have no handles
+    keyed.pull(handle(keyed, bent[1], bent[1]["tangents"][0]), 0, 30)
+    assert keyed.read_keys() == bent
+    keyed.part("smooth").check()
 
 
 def test_the_strip_shows_where_keys_leave_the_bound(keyed, rig):

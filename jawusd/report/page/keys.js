@@ -9,13 +9,14 @@ const monotoneTangents = (keys) => keys.map(({ frame, d }, k) => d.map((x, i) =>
   return before * after > 0 ? (3 * (back + on)) / ((2 * on + back) / before + (on + 2 * back) / after) : 0;
 }));
 
-// `changed` is called after every change. A key is { frame, d } and is never modified.
+// `changed` is called after every change. A key is { frame, d, tangents } and is never modified; `tangents`, optional, has
+// the slopes of d [mm per frame], null where the curve is monotone between keys.
 const makeKeys = (changed) => {
   let keys = [], tangents = [], smooth = true;
   const past = [], future = [];
   const put = (next) => {
     keys = [...next].sort((a, b) => a.frame - b.frame);
-    tangents = monotoneTangents(keys);
+    tangents = monotoneTangents(keys).map((slopes, k) => slopes.map((x, i) => keys[k].tangents?.[i] ?? x));
     changed();
   };
   const record = () => {
@@ -38,6 +39,10 @@ const makeKeys = (changed) => {
     const rise = t * t * (3 - 2 * t), [m, n] = [tangents[next - 1], tangents[next]];
     return a.d.map((x, i) => x + rise * (b.d[i] - x) + h * t * (1 - t) * ((1 - t) * m[i] - t * n[i]));
   };
+  const replace = (key, next) => {
+    put(keys.map((other) => (other === key ? next : other)));
+    return next;
+  };
   const rounded = (d) => d.map((x) => Math.round(x * 1e4) / 1e4 || 0);
   return {
     all: () => keys,
@@ -56,10 +61,17 @@ const makeKeys = (changed) => {
     },
     // Replace a key without a new step of undo, and return the new key; its frame stays if another key is there.
     move: (key, frame, d) => {
-      const changedKey = { frame: frame === key.frame || find(frame) ? key.frame : frame, d: rounded(d) };
-      put(keys.map((other) => (other === key ? changedKey : other)));
-      return changedKey;
+      return replace(key, { ...key, frame: frame === key.frame || find(frame) ? key.frame : frame, d: rounded(d) });
     },
+    // Set or, with null, remove the given slope of d[axis] at a key, without a new step of undo; return the new key.
+    bend: (key, axis, slope) => {
+      const given = [0, 1, 2].map((i) => (i === axis ? slope : (key.tangents?.[i] ?? null)));
+      const { tangents: _, ...plain } = key;
+      const known = given.map((x) => (x === null ? null : rounded([x])[0]));
+      return replace(key, known.every((x) => x === null) ? plain : { ...plain, tangents: known });
+    },
+    // Return the slopes [mm per frame] of smooth curves at a key; null if lines connect the keys.
+    slopes: (key) => (smooth ? (tangents[keys.indexOf(key)] ?? null) : null),
     undo: () => step(past, future),
     redo: () => step(future, past),
     canUndo: () => past.length > 0,

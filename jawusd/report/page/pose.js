@@ -36,6 +36,7 @@
       return off <= ROUNDING ? 0 : off <= data.tolerance ? 1 : 2;
     },
     keys: () => keys.all(),
+    slopes: (key) => keys.slopes(key),
   };
 
   // Return the paths of landmarks from a second before to a second after the frame.
@@ -156,6 +157,7 @@
       seek(next.frame);
       return next;
     },
+    bend: keys.bend,
   });
   const addKey = () => {
     setRunning(false);

@@ -3,12 +3,13 @@
 //
 // `motion` describes what is shown: span() is its first and last frame; at(frame) its parameters, null or not finite where
 // unknown; grade(frame, d) 0 inside the bound, 1 within the tolerance, 2 invalid, null unknown; behind(frame), optional,
-// a motion for comparison; keys(), optional, its keys; step, optional, the frames of an arrow key. `act` receives
-// seek(frame), and with keys choose(key), hold() before a key is dragged, and move(key, frame, d), which returns the new
-// key.
+// a motion for comparison; keys(), optional, its keys; slopes(key) the slopes of its curves there, null without handles;
+// step, optional, the frames of an arrow key. `act` receives seek(frame), and with keys choose(key), hold() before a key or
+// a handle is dragged, and move(key, frame, d) and bend(key, axis, slope or null), which return the new key.
 const makeTimeline = (canvas, motion, act) => {
   const GUTTER = 36, EDGE = 10, RULER = 20, STRIP = 9, ROW = motion.keys ? 20 : 6, FOOT = 8;
   const COLORS = ["--blue", "--vermilion", "--green"], GRADES = ["--green", "--orange", "--vermilion"];
+  const HANDLE = 44; // length of a handle [px]
   const LEAST = 8, MOST = 3; // shortest view [frames], and longest view relative to the span
   const pen = canvas.getContext("2d"), sheet = document.createElement("canvas"), ink = sheet.getContext("2d");
   const pointers = new Map();
@@ -90,6 +91,29 @@ const makeTimeline = (canvas, motion, act) => {
       });
     }
   };
+  // Return the ends of the handles of the chosen key: { key, axis, side, x, y }, a line along each curve to both sides.
+  const handles = () => {
+    const key = motion.keys?.().find((each) => each.frame === chosen), slopes = key && motion.slopes(key);
+    if (!slopes) return [];
+    const across = xOf(1) - xOf(0), up = yOf(1) - yOf(0);
+    return slopes.flatMap((slope, axis) => {
+      const scale = HANDLE / Math.hypot(across, slope * up);
+      return [-1, 1].map((side) => ({
+        key, axis, side, x: xOf(key.frame) + side * scale * across, y: yOf(key.d[axis]) + side * scale * slope * up,
+      }));
+    });
+  };
+  const handleMarks = (color) => {
+    ink.lineWidth = 1;
+    for (const { key, axis, x, y } of handles()) {
+      ink.strokeStyle = ink.fillStyle = color(COLORS[axis]);
+      ink.beginPath();
+      ink.moveTo(xOf(key.frame), yOf(key.d[axis]));
+      ink.lineTo(x, y);
+      ink.stroke();
+      ink.fillRect(x - 3, y - 3, 6, 6);
+    }
+  };
   const grid = (color) => {
     ink.textBaseline = "middle";
     ink.fillStyle = color("--soft");
@@ -142,14 +166,18 @@ const makeTimeline = (canvas, motion, act) => {
       ink.globalAlpha = 1;
     }
     curves(motion.at, color);
-    if (motion.keys) keyMarks(color);
+    if (motion.keys) {
+      handleMarks(color);
+      keyMarks(color);
+    }
     ink.restore();
     canvas.dataset.area = JSON.stringify({ left, right: right(), top, bottom: bottom(), view: seen(), range });
     paint();
   };
 
   // -- pointers ------------------------------------------------------------------------------------------------------
-  // Return the key under a point: its diamond, or its dot on a curve with the axis of that curve; null if there is none.
+  // Return the key under a point: its diamond, or its dot on a curve with the axis of that curve, or a handle with its
+  // side; null if there is none.
   const under = ([x, y], reach) => {
     let best = null, least = reach;
     for (const key of motion.keys?.() ?? []) {
@@ -158,6 +186,10 @@ const makeTimeline = (canvas, motion, act) => {
         const far = Math.hypot(x - xOf(key.frame), y - markY);
         if (far < least) [least, best] = [far, { key, axis }];
       }
+    }
+    for (const { key, axis, side, x: handleX, y: handleY } of handles()) {
+      const far = Math.hypot(x - handleX, y - handleY);
+      if (far < least) [least, best] = [far, { key, axis, side }];
     }
     return best;
   };
@@ -195,6 +227,11 @@ const makeTimeline = (canvas, motion, act) => {
       if (!held.moved) act.hold();
       held.moved = true;
       const value = range[0] + ((bottom() - at[1]) / (bottom() - top)) * (range[1] - range[0]);
+      if (held.side) {
+        const ahead = held.side * Math.max(held.side * (frameAt(at[0]) - held.key.frame), 2 * (frameAt(1) - frameAt(0)));
+        held.key = act.bend(held.key, held.axis, (value - held.key.d[held.axis]) / ahead);
+        return;
+      }
       const d = held.key.d.map((x, axis) => (axis === held.axis ? value : x));
       held.key = act.move(held.key, Math.max(Math.round(frameAt(at[0])), motion.span()[0]), d);
     } else if (held) scrub(at[0]);
@@ -217,7 +254,12 @@ const makeTimeline = (canvas, motion, act) => {
     const size = length * Math.exp(event.deltaY / 500), share = (x - left) / (right() - left);
     setView(frameAt(x) - share * within(size, LEAST, Infinity), size);
   }, { passive: false });
-  canvas.addEventListener("dblclick", () => setView(motion.span()[0], motion.span()[1] - motion.span()[0]));
+  canvas.addEventListener("dblclick", (event) => {
+    const found = under(place(event), 9);
+    if (!found?.side) return setView(motion.span()[0], motion.span()[1] - motion.span()[0]);
+    act.hold();
+    act.bend(found.key, found.axis, null);
+  });
   canvas.addEventListener("keydown", (event) => {
     const [first, last] = motion.span(), step = motion.step ?? 1;
     const to = { ArrowLeft: frame - step, ArrowRight: frame + step, Home: first, End: last }[event.key];
