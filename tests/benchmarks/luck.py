@@ -90,6 +90,8 @@ def rewritten(
             values = picture.to_ndarray(format=layout)
             if index in hidden:
                 values = np.random.default_rng(index).integers(0, 256, values.shape, dtype=np.uint8)
+                if layout == "gray":  # masks are black and white
+                    values = np.where(values > 127, 255, 0).astype(np.uint8)
             if rng is not None:
                 luma = values[: picture.height].astype(np.int16)
                 luma += rng.integers(-1, 2, luma.shape, dtype=np.int16)
