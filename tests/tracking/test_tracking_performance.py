@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 import small_take
-from bumpy_teeth import disturbed, jaw_poses, render_masks
+from bumpy_teeth import disturbed, jaw_poses, make_cameras, render_masks
 from example_model import LANDMARKS_ANATOMICAL, example_arrays, example_meta
 
 from jawusd.base.errors import TrackingError
@@ -291,8 +291,8 @@ def test_a_worn_camera_sees_one_head(jaw, scans, truth, tmp_path):
 
 
 @pytest.mark.slow
-def test_one_camera_finds_where_to_begin(jaw, scans, truth, folder):
-    camera = small_take.CAMERAS[0]
+def begun(jaw, scans, truth, folder, camera):
+    """Search for the start with one camera; return the step from the true pose of the frame found."""
     source = small_take.source(folder, camera.name)
     capture = small_take.make_capture(folder, COUNT, cameras=[source], bootstrap=None)
     with_d = JawRig({**jaw.arrays, "codes": np.vstack([truth[0], [[2.0, 0, 0], [14.0, 1, 1]]])}, jaw.meta)
@@ -303,5 +303,22 @@ def test_one_camera_finds_where_to_begin(jaw, scans, truth, folder):
     search = SingleStart(small_take.MESHES, ContourSolver(scans, TrackingConfig()), with_d, np.eye(4))
     found = search.find(footage)
     k = found.frame - small_take.FIRST
-    away = Coordinates(jaw, scans).step(Pose(truth[1][k], truth[0][k]), found.pose)
+    return Coordinates(jaw, scans).step(Pose(truth[1][k], truth[0][k]), found.pose)
+
+
+def test_one_camera_finds_where_to_begin(jaw, scans, truth, folder):
+    away = begun(jaw, scans, truth, folder, small_take.CAMERAS[0])
     assert np.abs(away[:3]).max() < 0.03 and np.abs(away[3:]).max() < 1.5
+
+
+def test_a_side_camera_finds_where_to_begin_from_half_of_the_teeth(jaw, scans, truth, tmp_path, monkeypatch):
+    """The centres of the masks lie far beside the front teeth; only one frame is searched."""
+    monkeypatch.setattr("jawusd.tracking.performance.single_start._MOST_TRIED", 1)
+    camera = make_cameras((45.0,))[0]
+    folder = write_masks(tmp_path, jaw, truth, [camera])
+    for path in folder.rglob("*.png"):
+        mask = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+        mask[:, : int(np.percentile(np.nonzero(mask)[1], 45))] = 0
+        cv2.imwrite(str(path), mask)
+    away = begun(jaw, scans, truth, folder, camera)
+    assert np.abs(away[:3]).max() < 0.05 and np.abs(away[3:]).max() < 2.0

@@ -43,20 +43,23 @@ _PX_PER_MM = 2.0
 _ANYWHERE_MM = 200.0
 # Number of frames surveyed for large masks; numbers of frames searched if a start is accepted, and otherwise.
 _SURVEYED, _FRAMES_TRIED, _MOST_TRIED = 24, 4, 10
-# Candidate widths of the visible teeth [mm], from the front teeth to a whole arch, each an eighth larger than the one
-# before.
-_WIDTHS_MM = 22.0 * 1.125 ** np.arange(12)
+# Candidate widths of the visible teeth [mm], from the front teeth to a whole arch, each a tenth larger than the one
+# before. They determine the distance from the camera.
+_WIDTHS_MM = 22.0 * 1.1 ** np.arange(14)
 _USUAL_WIDTH_MM = 42.0
+# A side camera sees more of one side of the arch, so the centre of its mask lies up to 16 mm beside the front teeth (18
+# cameras of 6 synthetic persons).
 _GRID = Grid(
-    yaw_rad=np.radians(np.arange(-56, 57, 8.0)),
+    yaw_rad=np.radians(np.arange(-60, 61, 10.0)),
     pitch_rad=np.radians(np.arange(-32, 33, 8.0)),
     roll_rad=np.radians(np.arange(-32, 33, 8.0)),
-    reach_mm=(9.0, 7.5, 0.1),
+    reach_mm=(18.0, 7.5, 0.1),
 )
 _SHIFTS = np.stack(np.meshgrid(*[np.arange(-3, 3.1, 1.5)] * 2, [0.0], indexing="ij"), axis=-1).reshape(-1, 3)
-# Numbers of head poses kept, of jaw poses tried with each of these, of pairs of head and jaw poses aligned in a few
-# steps, of pairs aligned fully, and of pairs aligned at the working resolution.
-_HEADS, _JAWS, _TRIED, _FINALISTS, _WINNERS = 240, 32, 160, 24, 5
+# Numbers per candidate width of head poses kept, of jaw poses tried with each of these, and of pairs of head and jaw
+# poses aligned in a few steps; numbers of pairs aligned fully, and at the working resolution. Each distance has its
+# share, since masks rank distances poorly before poses are aligned: near teeth cover more of them.
+_HEADS, _JAWS, _TRIED, _FINALISTS, _WINNERS = 17, 32, 12, 24, 5
 # Penalty per crown pixel outside the mask, in px of contour [1/px]: low, since lips may hide crowns.
 _OUTSIDE_PRICE = 0.05
 _DISTINCT_MM = 3.0  # minimum distance between head poses that are kept [mm], as mean displacement of the teeth
@@ -158,20 +161,19 @@ class SingleStart:
         The upper arch alone hardly constrains the distance, so head poses are ranked after a few alignment steps with
         both arches.
         """
-        found: list[Candidate] = []
+        instant, few = self._rough.instant(views), self._rough.config.trial_gates_px
+        tried: list[tuple[float, Pose]] = []
         for pair in places:
             base = make_transform(guessed_axes(pair, views[0].eye[None]), pair[0])
-            found += search_arch(self._coarse[0], 0, views, _PX_PER_MM, base, self._hinge, _GRID, self._map)
-        found = [
-            replace(head, objective=head.objective - self._outside_price(0, head.pose, views[0])) for head in found
-        ]
-        heads = self._distinct(sorted(found, key=lambda head: -head.objective))
-        pairs = sorted(
-            (pair for some in self._map(partial(self._with_jaws, views), heads) for pair in some), key=_descending
-        )
-        instant = self._rough.instant(views)
-        few = self._rough.config.trial_gates_px
-        tried = [(self._after(pose, instant, few)[0], pose) for _, pose in pairs[:_TRIED]]
+            found = search_arch(self._coarse[0], 0, views, _PX_PER_MM, base, self._hinge, _GRID, self._map)
+            found = [
+                replace(head, objective=head.objective - self._outside_price(0, head.pose, views[0])) for head in found
+            ]
+            heads = self._distinct(sorted(found, key=lambda head: -head.objective))
+            pairs = sorted(
+                (pair for some in self._map(partial(self._with_jaws, views), heads) for pair in some), key=_descending
+            )
+            tried += [(self._after(pose, instant, few)[0], pose) for _, pose in pairs[:_TRIED]]
         return [pose for _, pose in sorted(tried, key=_descending)[:_FINALISTS]]
 
     def _distinct(self, found: Sequence[Candidate]) -> list[Candidate]:
