@@ -199,7 +199,7 @@ def _separator(text: str, comment: str) -> str:
 
 
 def to_numbers(cells: Sequence[Sequence[str]], named: Callable[[int, int], str], path: Path) -> Array:
-    """Return cells as numbers of the same shape; `nan` and `inf` are kept.
+    """Return cells as an array of numbers of the same shape; `nan` and `inf` are kept.
 
     Args:
         cells: rows of equal length.

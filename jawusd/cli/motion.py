@@ -192,7 +192,7 @@ class Knots(NamedTuple):
 
 
 def knots_of(rig: JawRig, motion: AuthoredMotion) -> Knots:
-    """Return the keys of a motion with their tangents, plus all samples of segments changed by the bound."""
+    """Return the keys of a motion with their tangents, plus all samples of segments that the bound changed."""
     known = np.isfinite(motion.d).all(axis=1)
     frames, d = motion.frames[known], motion.d[known]
     if motion.keys is None:

@@ -158,7 +158,7 @@ def single_margin(bound: Array, d1: float, d2: float, d3: float) -> float:
 
 @compiled("void(f8[::1], f8[:,::1], f8[::1])")
 def margins(bound: Array, d: Array, out: Array) -> None:
-    """Write the signed distances (n,) [mm] from d (n, 3) [mm] to the bound, positive inside, to out."""
+    """Write to `out` the signed distances (n,) [mm] from d (n, 3) [mm] to the bound, positive inside."""
     v = hull_scratch(bound)
     for row in range(len(d)):
         out[row] = np.nan

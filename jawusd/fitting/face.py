@@ -118,7 +118,8 @@ def offsets_between(face_s: Array, times_s: Array) -> Array:
     shorter = min(face_s[-1] - face_s[0], times_s[-1] - times_s[0]) if len(times_s) > 1 else 0.0
     if shorter < _LEAST_SECONDS:
         raise FittingError(
-            f"the takes last {shorter:.1f} s; at least {_LEAST_SECONDS:g} s are needed to learn a mapping."
+            f"the shorter of the two takes lasts {shorter:.1f} s; at least {_LEAST_SECONDS:g} s are needed to learn a "
+            "mapping."
         )
     return np.arange(times_s[0] + shorter / 2 - face_s[-1], times_s[-1] - shorter / 2 - face_s[0], COARSE_S)
 

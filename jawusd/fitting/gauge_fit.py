@@ -20,7 +20,8 @@ FADE_MM = 14.0  # opening [mm] at which tooth guidance has decreased to 1/e
 
 _PATH_DEGREE, _PATH_ITERATIONS, _PATH_RIDGE = 5, 40, 1e-5
 _SMALLEST_SPREAD_MM = 0.3  # minimum scale s of the residuals of the habitual path [mm]
-#: Minimum range of openings (1st to 99th percentile) for fitting a path [mm]; in a smaller range, closed teeth glide.
+#: Minimum range of openings (1st to 99th percentile) for fitting a path [mm]; motion over a smaller range is mostly
+#: gliding with the teeth closed.
 SMALLEST_OPENING_MM = 5.0
 
 _ROUNDS = 3

@@ -233,7 +233,7 @@ def _refuse_other_files(path: Path) -> None:
             is_text = b"\0" not in file.read(_MOST_LOOKED_AT)
         if not is_text:
             raise FormatError(
-                f'is not text, and "{path.suffix}" is not a capture: a capture is a folder with a capture.toml.',
+                "is a binary file; a capture is a folder with a capture.toml.",
                 path=path,
                 hint=f"Create one for this footage: jawusd init {path.parent}",
             )

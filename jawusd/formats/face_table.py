@@ -106,7 +106,10 @@ def _face_of(table: TextTable) -> FaceTable:
     wrong = ~np.isfinite(frames)
     wrong[1:] |= ~(np.diff(frames) > 0)
     if wrong.any():
-        raise FormatError(f"{table.named(int(np.argmax(wrong)), clock)} does not increase.", path=table.path)
+        raise FormatError(
+            f"{table.named(int(np.argmax(wrong)), clock)} must be a finite number above that of the row before.",
+            path=table.path,
+        )
     filled = [[cell if cell.strip() else "nan" for cell in row] for row in table.rows]
     X = TextTable(table.path, table.header, filled, table.places).numbers(others)
     X[~np.isfinite(X)] = np.nan

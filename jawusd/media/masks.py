@@ -289,7 +289,7 @@ class _Ahead:
                     self._put(item, None)
                     if self._stopping.is_set():
                         return
-        except Exception as error:  # the reading thread raises this exception again
+        except Exception as error:  # raised again by `take`, in the thread of the caller
             self._put(None, error)
 
     def _put(self, item: MaskImage | None, error: Exception | None) -> None:

@@ -268,6 +268,6 @@ class Video(Clip):
 
 
 def _timecode(container: av.container.InputContainer, stream: av.VideoStream) -> str:
-    """Return the time code of the first image from the video stream, a time code track, or the file's metadata."""
+    """Return the time code of the first image, stored in the video stream, a time code track or the file's metadata."""
     tables = [stream.metadata, *(other.metadata for other in container.streams), container.metadata]
     return next((table["timecode"] for table in tables if table.get("timecode")), "")

@@ -24,7 +24,7 @@ STEP_MM = 0.8
 _GRID_MM = 0.5  # step of the distance grid; clearances differ by at most 0.014 mm from those of a 0.25 mm grid
 # Indices of the left and the right condyle.
 _CONDYLES = [index for index, name in enumerate(LANDMARKS) if name.startswith("condyle")]
-_CONDYLE_MM = 10.0  # distance from the condyle landmark that includes the condylar head but not the coronoid process
+_CONDYLE_MM = 10.0  # radius around the condyle landmark that includes the condylar head but not the coronoid process
 _REACH_MM = 26.0  # maximum translation of the condylar head, which may move past the articular eminence
 _COARSEST_MM = 4.0  # maximum median edge length of a bone's triangles; a condyle is about 8 mm deep
 _FEWEST_FACES = 30

@@ -82,7 +82,7 @@ class ScanSurface:
         return np.stack(np.divmod(np.unique(pairs[:, 0] * n + pairs[:, 1]), n), axis=1)
 
     def edge_mm(self, edges: Indices) -> float:
-        """Return the median length of edges (E, 2) [mm]."""
+        """Return the median length [mm] of edges (E, 2)."""
         return float(np.median(np.linalg.norm(self.vertices[edges[:, 0]] - self.vertices[edges[:, 1]], axis=1)))
 
     def wound(self, up: Array) -> ScanSurface:
@@ -200,7 +200,7 @@ def _tangents(normals: Array) -> tuple[Array, Array]:
     return one, np.cross(normals, one)
 
 
-# Decay length of step weights with inward curvature: they are multiplied by exp(-_CREASE_DECAY_MM * curvature).
+# Length over which step weights decay as inward curvature grows: their factor is exp(-_CREASE_DECAY_MM * curvature).
 _CREASE_DECAY_MM = 2.5
 _SHARPEST = 3.0  # maximum curvature in the step weights [1/mm]; larger curvatures are clamped to it
 # Weight of colour: the approximate probability per step that a walk stops. A stopped walk ends in crown or gum at

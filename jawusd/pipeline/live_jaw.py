@@ -184,10 +184,12 @@ class FaceStream:
                 relative to the head.
         """
         if options.rigid:
-            raise FormatError("is read while it is written; --rigid applies to recorded faces only.", path=options.face)
+            raise FormatError(
+                "is read while it is being written; --rigid applies only to recorded faces.", path=options.face
+            )
         if os.fspath(options.face) != STANDARD_INPUT and not Path(options.face).exists():
             raise FormatError(
-                "there is no such file.", path=options.face, hint="Give a file, a pipe, or - for the standard input."
+                "there is no such file.", path=options.face, hint="Give a file, a pipe, or - for standard input."
             )
         self._skin, self._options = skin, options
         self._rows, self._ahead_s = deque[tuple[float, Array]](maxlen=_KEPT), deque[float](maxlen=_KEPT)

@@ -81,7 +81,7 @@ class SkinOfShot:
         found = self._skin(columns_at(self._face_s + self._known_offset(), self._columns, times))
         if not found.familiar.any():
             raise FittingError(
-                f"{os.fspath(self._face)}: in none of the {len(frames)} frames does the face resemble those from "
+                f"{os.fspath(self._face)}: the face of the {len(frames)} frames never resembles the face data from "
                 "which the map was learned.",
                 hint="Check the units of face and map (--length-unit), the rigid body of the head (--rigid) and the "
                 "offset of the clocks (--offset).",

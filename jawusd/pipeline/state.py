@@ -111,7 +111,7 @@ class BuildState:
         """Return an error for every file that is missing or differs from what the build wrote."""
         outputs = [output for record in self.stages.values() for output in record.outputs.items()]
         return [
-            Finding("build_changed", "error", f"{message} since the build", path=name, hint=_MAKE_AGAIN)
+            Finding("build_changed", "error", message, path=name, hint=_MAKE_AGAIN)
             for name, expected in sorted(outputs)
             if (message := self._changed(name, expected))
         ]
@@ -120,8 +120,8 @@ class BuildState:
         path = self.folder / name
         try:
             if not path.is_file():
-                return "is missing"
-            return "" if hash_files([path]) == expected else "was modified or replaced"
+                return "is missing, although the build wrote it"
+            return "" if hash_files([path]) == expected else "was modified or replaced after the build"
         except OSError as error:
             return f"cannot be read ({error.strerror})"
 

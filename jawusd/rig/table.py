@@ -47,7 +47,7 @@ def valid_box(rig: JawRig) -> Array:
     probes = grid_points(axes)
     valid = probes[rig.margin(probes) >= 0]
     if not len(valid):
-        raise RigError("the bounds of the model allow no parameters.")
+        raise RigError("no parameters lie inside the bound of the model.")
     step = np.array([axis[1] - axis[0] for axis in axes])
     low, high = valid.min(axis=0) - step, valid.max(axis=0) + step
     return np.stack([np.minimum(box[:, 0], low), np.maximum(box[:, 1], high)], axis=1).clip(wide[:, :1], wide[:, 1:])

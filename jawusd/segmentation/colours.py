@@ -49,9 +49,10 @@ class SegmentationConfig:
     reach_mm: tuple[float, ...] = (1.6, 1.0)
     # Time constant of the colour histograms [frames]; the light changes slowly, as the head moves.
     memory_frames: float = 24.0
-    # Quantile of the log-odds in the surroundings that tooth colours must exceed [-], since the separability of colours
-    # differs between subjects; and additional margin that is required without evidence from position [-].
+    # The log-odds of tooth colours must exceed this quantile of the log-odds in the surroundings [-]: a quantile, since
+    # the separability of colours differs between subjects.
     surroundings_share: float = 0.95
+    # Margin that is added to this quantile where position gives no evidence [-].
     doubt: float = 1.5
     # Minimum and maximum of the required log-odds [-].
     doubt_range: tuple[float, float] = (-1.0, 1.0)

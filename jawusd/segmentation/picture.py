@@ -68,7 +68,7 @@ class PictureFrame:
         return self._working.part(mask, (slice(y, y + height), slice(x, x + width)))
 
     def recorded(self, shares: NDArray[np.float32], window: Window) -> NDArray[np.uint8]:
-        """Convert the tooth coverage in a window, shape (h, w), to a mask at recorded size, 0 or 255."""
+        """Convert the tooth coverage in a window, shape (h, w), to a mask at recorded size with values 0 and 255."""
         nodes = self._back[::_NODE_PX, ::_NODE_PX] - np.array(window.corner, np.float32)
         limit = np.array(shares.shape[::-1], np.float32) + _NODE_PX
         inside: Mask = np.all((nodes > -_NODE_PX) & (nodes < limit), axis=2)

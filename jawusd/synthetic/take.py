@@ -247,7 +247,7 @@ class Scene:
     def draw(
         self, camera: int, take: Take, index: int, poses: dict[str, Array], jitter_px: tuple[Array, Array] | None
     ) -> Picture:
-        """Render a frame, with `poses` from `pose` and `jitter_px` as in `Renderer.render`."""
+        """Render a frame; `poses` comes from `pose`, and `jitter_px` is as in `Renderer.render`."""
         return self._renderer.render(camera, poses, take.T_world_skull[index], float(take.light[index]), jitter_px)
 
     def occluders(self, take: Take, index: int) -> list[Mesh]:

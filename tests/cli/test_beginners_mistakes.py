@@ -36,7 +36,7 @@ def place(tmp_path_factory):
 MISTAKES = [
     ("a capture that is not there", ["check", "nowhere"], ["there is no such file", "nowhere"]),
     ("a folder without capture.toml", ["check", "empty"], ["there is no such file", "jawusd init"]),
-    ("a video in place of a capture", ["build", "left.mp4", "-o", "out"], ["is not a capture", "jawusd init"]),
+    ("a video in place of a capture", ["build", "left.mp4", "-o", "out"], ["a capture is a folder", "jawusd init"]),
     ("a scan in place of a capture", ["build", "u.ply", "-o", "out"], ["u.ply"]),
     ("text that is no TOML", ["check", "spaces in.toml"], ["is not valid TOML"]),
     ("no output folder", ["build", "."], ["--out"]),

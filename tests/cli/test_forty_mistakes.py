@@ -89,7 +89,7 @@ TYPED = [
     ("a folder without capture", ["check", "empty"], "empty", "no such file", "", "jawusd init"),
     ("a folder's name misspelt", ["check", "emty"], "emty", "no such file", "Did you mean empty?", "jawusd init"),
     ("a path from another folder", ["check", "shots/anna"], "shots/anna", "no such file", "the current folder", ""),
-    ("a clip for a capture", ["check", "left.mp4"], "left.mp4", '".mp4" is not a capture', "a folder", "jawusd init"),
+    ("a clip for a capture", ["check", "left.mp4"], "left.mp4", "is a binary file", "a folder", "jawusd init"),
     ("an output with files", ["build", ".", "-o", "full"], "full", "not empty", "", "Choose a new folder"),
     ("an output that is a file", ["build", ".", "-o", "u.ply"], "u.ply", "is a file", "needs a folder", "Choose a new"),
     ("an output out of reach", ["build", ".", "-o", "/dev/null/out"], "out", "cannot write here", "", "Choose a"),

@@ -117,7 +117,7 @@ def test_face_tables_are_columns_or_points(tmp_path):
         ("frame\n1\n", "other columns, and at least one row"),
         ("frame,a\n", "other columns, and at least one row"),
         ("frame,a,frame\n1,2,3\n", "other columns, and at least one row"),
-        ("frame,a\n2,1\n2,1\n", 'line 3, column "frame" does not increase'),
+        ("frame,a\n2,1\n2,1\n", 'line 3, column "frame" must be a finite number above that of the row before'),
         ("frame,a\n2,x\n", 'line 2, column "a": "x" is not a number'),
     ],
 )

@@ -145,7 +145,7 @@ class Smoother:
         return replace(fit, pose=pose)
 
     def _rig_gain(self, fit: FrameFit, weight: Array) -> Array:
-        """Return the derivative (3, 6) of d with respect to an error of the rig; 0 where d is not from outlines."""
+        """Return the derivative (3, 6) of d with respect to an error of the rig; 0 if outlines do not determine d."""
         if fit.solution is None or not fit.found[1]:
             return np.zeros((3, 6))
         outlines = self._instants.outline_equations(fit.pose, fit.solution, weight * fit.found)
