@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
+import signal
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -200,8 +203,7 @@ def _serve_capture(
 
     with progress() as report:
         viewer = open_capture_viewer(capture, tracks, host, port, report, allow_outside=allow_outside)
-    _announce(browser, viewer.url)
-    _serve(viewer)
+    _serve(viewer, browser)
 
 
 def _serve_rig(rig: Path | None, host: str, port: int, prim: str | None, browser: bool, play: bool) -> None:
@@ -209,14 +211,29 @@ def _serve_rig(rig: Path | None, host: str, port: int, prim: str | None, browser
     from jawusd.pipeline.view import open_viewer
 
     if rig is not None:
-        viewer = open_viewer(rig, host, port, prim, play=play)
-        _announce(browser, viewer.url)
-    else:
-        try:
+        _serve(open_viewer(rig, host, port, prim, play=play), browser)
+        return
+    viewer = None
+    try:
+        with _interrupts_held():
             viewer = open_viewer(None, host, port, prim, play=play, opened=partial(_announce, browser))
-        except KeyboardInterrupt:  # also stops a page that is not complete
-            return
-    _serve(viewer)
+        viewer.wait()
+    except KeyboardInterrupt:
+        if viewer is not None:
+            viewer.stop()
+
+
+@contextlib.contextmanager
+def _interrupts_held() -> Iterator[None]:
+    """Raise KeyboardInterrupt for Ctrl+C only at the end of the block: OpenUSD discards it while it is imported."""
+    held: list[int] = []
+    before = signal.signal(signal.SIGINT, lambda number, _: held.append(number))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+    if held:
+        raise KeyboardInterrupt
 
 
 def _announce(browser: bool, url: str) -> None:
@@ -228,9 +245,10 @@ def _announce(browser: bool, url: str) -> None:
         webbrowser.open(url)
 
 
-def _serve(viewer: PageServer) -> None:
-    """Serve a page until Ctrl+C."""
+def _serve(viewer: PageServer, browser: bool) -> None:
+    """Announce the address of a page and serve it until Ctrl+C, which may follow the address at once."""
     try:
+        _announce(browser, viewer.url)
         viewer.wait()
     except KeyboardInterrupt:
         viewer.stop()

@@ -165,11 +165,11 @@ class Viewer(PageServer):
             self._actor = load()
             self._static = StaticPlots(self._actor.rig)
             set_first_view(self._server, self._static.rest)
+            self._loaded.set_result(None)
         except BaseException:
             self._loaded.cancel()
             self.stop()
             raise
-        self._loaded.set_result(None)
 
     def show(self, d: Array) -> None:
         """Show the jaw at parameters (3,) [mm] on all open pages; drop poses that arrive too fast to be drawn."""

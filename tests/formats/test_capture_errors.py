@@ -109,7 +109,7 @@ def test_one_camera_as_a_single_table(told):
 
 def test_a_video_is_no_capture(tmp_path):
     (tmp_path / "take.mp4").write_bytes(b"\0\xff\0ftyp")
-    assert "not a capture" in read_capture(tmp_path / "take.mp4")[1][0].message
+    assert "is a binary file; a capture is a folder" in read_capture(tmp_path / "take.mp4")[1][0].message
     assert f"jawusd init {tmp_path}" in str(read_capture(tmp_path / "take.mp4")[1][0])
     assert f"jawusd init {tmp_path}" in str(read_capture(tmp_path)[1][0])
     away = tmp_path / "none"

@@ -130,7 +130,7 @@ def test_maps_and_faces_of_others_are_refused(learned, options, tmp_path):
     other.write_text(HEADER.replace("time_s", "frame") + "\n" + lines([0.0], np.zeros((1, 4, 3)))[0])
     with pytest.raises(FormatError, match="--face-fps"):
         LiveSkin(rig, replace(options, face=other), recorded=True)
-    with pytest.raises(FormatError, match="--rigid applies to recorded faces"):
+    with pytest.raises(FormatError, match="--rigid applies only to recorded faces"):
         LiveSkin(rig, replace(options, rigid={"head": "1,2,3"}), recorded=False)
     with pytest.raises(FormatError, match="no such file.*a pipe, or -"):
         LiveSkin(rig, replace(options, face=tmp_path / "nothing.csv"), recorded=False)

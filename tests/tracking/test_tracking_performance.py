@@ -290,7 +290,6 @@ def test_a_worn_camera_sees_one_head(jaw, scans, truth, tmp_path):
     assert np.linalg.norm(head, axis=-1).max() < 0.5 and np.isfinite(found.covariance).all()
 
 
-@pytest.mark.slow
 def begun(jaw, scans, truth, folder, camera):
     """Search for the start with one camera; return the step from the true pose of the frame found."""
     source = small_take.source(folder, camera.name)
@@ -306,11 +305,13 @@ def begun(jaw, scans, truth, folder, camera):
     return Coordinates(jaw, scans).step(Pose(truth[1][k], truth[0][k]), found.pose)
 
 
+@pytest.mark.slow
 def test_one_camera_finds_where_to_begin(jaw, scans, truth, folder):
     away = begun(jaw, scans, truth, folder, small_take.CAMERAS[0])
     assert np.abs(away[:3]).max() < 0.03 and np.abs(away[3:]).max() < 1.5
 
 
+@pytest.mark.slow
 def test_a_side_camera_finds_where_to_begin_from_half_of_the_teeth(jaw, scans, truth, tmp_path, monkeypatch):
     """The centres of the masks lie far beside the front teeth; only one frame is searched."""
     monkeypatch.setattr("jawusd.tracking.performance.single_start._MOST_TRIED", 1)
