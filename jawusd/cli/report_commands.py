@@ -37,7 +37,6 @@ from jawusd.formats.atomic import refuse_existing
 
 if TYPE_CHECKING:
     from jawusd.formats.experiments import Experiments
-    from jawusd.viewer.server import PageServer
 
 
 def report(
@@ -203,20 +202,24 @@ def _serve_capture(
 
     with progress() as report:
         viewer = open_capture_viewer(capture, tracks, host, port, report, allow_outside=allow_outside)
-    _serve(viewer, browser)
+    try:
+        _announce(browser, viewer.url)
+        viewer.wait()
+    except KeyboardInterrupt:
+        viewer.stop()
 
 
 def _serve_rig(rig: Path | None, host: str, port: int, prim: str | None, browser: bool, play: bool) -> None:
     """Serve the page of a rig, or of the example rig, which is valid, so that a browser can start before it is read."""
     from jawusd.pipeline.view import open_viewer
 
-    if rig is not None:
-        _serve(open_viewer(rig, host, port, prim, play=play), browser)
-        return
+    announce = partial(_announce, browser)
     viewer = None
     try:
         with _interrupts_held():
-            viewer = open_viewer(None, host, port, prim, play=play, opened=partial(_announce, browser))
+            viewer = open_viewer(rig, host, port, prim, play=play, opened=announce if rig is None else None)
+        if rig is not None:
+            announce(viewer.url)
         viewer.wait()
     except KeyboardInterrupt:
         if viewer is not None:
@@ -243,15 +246,6 @@ def _announce(browser: bool, url: str) -> None:
     say(f"{url}  (Ctrl+C stops)")
     if browser:
         webbrowser.open(url)
-
-
-def _serve(viewer: PageServer, browser: bool) -> None:
-    """Announce the address of a page and serve it until Ctrl+C, which may follow the address at once."""
-    try:
-        _announce(browser, viewer.url)
-        viewer.wait()
-    except KeyboardInterrupt:
-        viewer.stop()
 
 
 def _write_page(rig: Path | None, page: Path, force: bool, prim: str | None, footage: bool) -> None:
