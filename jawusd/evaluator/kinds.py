@@ -64,28 +64,24 @@ COMMON: dict[str, ArraySpec] = {
 }
 
 
-#: Arrays of the clearance of the teeth, all present or none; see `jawusd.evaluator.contact`.
-CONTACT_ARRAYS: dict[str, ArraySpec] = {
-    "contact_first_mm": ArraySpec("jaw:contact:first", (3,)),
-    "contact_step_mm": ArraySpec("jaw:contact:step", (3,)),
-    "contact_shape": ArraySpec("jaw:contact:shape", (3,), integer=True),
-    "contact_values": ArraySpec("jaw:contact:clearances", ("clearances",), integer=True),
-    "contact_closed_mm": ArraySpec("jaw:contact:closed"),
-    "contact_error_mm": ArraySpec("jaw:contact:error"),
-    "contact_limit_mm": ArraySpec("jaw:contact:limit"),
-}
+def _clearance_arrays(prefix: str, namespace: str, size: str) -> dict[str, ArraySpec]:
+    """Return the arrays of a clearance table by name: `prefix` begins the names, `namespace` those of attributes."""
+    return {
+        f"{prefix}_first_mm": ArraySpec(f"{namespace}:first", (3,)),
+        f"{prefix}_step_mm": ArraySpec(f"{namespace}:step", (3,)),
+        f"{prefix}_shape": ArraySpec(f"{namespace}:shape", (3,), integer=True),
+        f"{prefix}_values": ArraySpec(f"{namespace}:clearances", (size,), integer=True),
+        f"{prefix}_closed_mm": ArraySpec(f"{namespace}:closed"),
+        f"{prefix}_error_mm": ArraySpec(f"{namespace}:error"),
+        f"{prefix}_limit_mm": ArraySpec(f"{namespace}:limit"),
+    }
 
+
+#: Arrays of the clearance of the teeth, all present or none; see `jawusd.evaluator.contact`.
+CONTACT_ARRAYS = _clearance_arrays("contact", "jaw:contact", "clearances")
 
 #: Arrays of the clearance between condyles and skull, for rigs with scanned bones, all present or none.
-JOINT_ARRAYS: dict[str, ArraySpec] = {
-    "joint_first_mm": ArraySpec("jaw:joints:first", (3,)),
-    "joint_step_mm": ArraySpec("jaw:joints:step", (3,)),
-    "joint_shape": ArraySpec("jaw:joints:shape", (3,), integer=True),
-    "joint_values": ArraySpec("jaw:joints:clearances", ("joint clearances",), integer=True),
-    "joint_closed_mm": ArraySpec("jaw:joints:closed"),
-    "joint_error_mm": ArraySpec("jaw:joints:error"),
-    "joint_limit_mm": ArraySpec("jaw:joints:limit"),
-}
+JOINT_ARRAYS = _clearance_arrays("joint", "jaw:joints", "joint clearances")
 
 #: Arrays of the speeds in a take with a known frame rate, both present or both absent; see `jawusd.evaluator.speeds`.
 SPEED_ARRAYS: dict[str, ArraySpec] = {
