@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 
@@ -187,6 +188,30 @@ class VideoMasks:
             if odd:
                 self.odd[frame.index] = f"image {frame.index} {odd}"
             yield mask
+
+
+@dataclass(frozen=True, eq=False)
+class OneMask:
+    """A mask in memory, of one frame.
+
+    Attributes:
+        frame: frame number of the camera.
+        image: 255 for tooth, 0 for background, shape (h, w).
+        odd: reasons why images were rejected; none.
+    """
+
+    frame: int
+    image: MaskImage
+    odd: dict[int, str] = field(default_factory=dict)
+
+    @property
+    def count(self) -> int:
+        """One past the last frame number."""
+        return self.frame + 1
+
+    def masks(self, first: int) -> Iterator[MaskImage | None]:
+        """Yield the masks from a frame number on, (h, w) uint8, or None for other frames."""
+        return (self.image if frame == self.frame else None for frame in range(first, self.count))
 
 
 def _names(files: Mapping[int, Path]) -> dict[int, str]:

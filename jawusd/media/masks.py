@@ -7,6 +7,7 @@ import os
 import queue
 import threading
 from collections.abc import Callable, Generator, Iterator
+from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
 from types import TracebackType
@@ -17,12 +18,27 @@ from jawusd.formats.clips import ClipSource
 from jawusd.formats.file_names import is_pattern
 from jawusd.media.clip import Timeline
 from jawusd.media.footage import open_clip
-from jawusd.media.mask_files import LabelValues, PngMasks, VideoMasks
+from jawusd.media.mask_files import LabelValues, OneMask, PngMasks, VideoMasks
 from jawusd.media.mask_levels import MaskImage, MaskLevels
 from jawusd.media.video import Video
 
 _LOOKED_AT = 10  # number of label images that are sampled
 _AHEAD = 4  # number of buffered images; the buffer takes 8 MB per reader for full HD
+
+
+@dataclass(frozen=True, eq=False)
+class FrameMasks:
+    """Masks of both arches in one frame of a camera, which are in memory.
+
+    Attributes:
+        name: name of the camera.
+        frame: frame number of the camera.
+        masks: upper and lower arch: 255 for tooth, 0 for background, shape (2, h, w).
+    """
+
+    name: str
+    frame: int
+    masks: MaskImage
 
 
 class MaskReader:
@@ -41,7 +57,7 @@ class MaskReader:
 
     def __init__(
         self,
-        path: str | os.PathLike[str],
+        path: str | os.PathLike[str] | OneMask,
         size_px: tuple[int, int],
         *,
         timeline: Timeline | None = None,
@@ -52,7 +68,7 @@ class MaskReader:
 
         Args:
             path: a PNG pattern with one `%d` or `%06d` (the index of the image in the camera's video), or a video with
-                one mask per image, or per frame, of the camera's video.
+                one mask per image, or per frame, of the camera's video; or a mask in memory.
             timeline: timeline of the camera's video; if it is None, PNG files are numbered by frame.
             labels: for label images, the gray values of the requested arch and of the other arch.
             prepare: function applied to each mask in the background thread, such as `WorkingView.mask`.
@@ -61,18 +77,21 @@ class MaskReader:
             CaptureError: the folder or file is missing, has no masks, or their size or number is wrong.
         """
         self._labels = labels
-        self.path = Path(path)
-        self._source: PngMasks | VideoMasks
+        self._source: PngMasks | VideoMasks | OneMask
         self._timeline: Timeline | None
-        if is_pattern(self.path):
-            self._source = pngs = PngMasks(self.path, size_px, labels)
-            self._timeline = _timeline_of_pngs(self.path, pngs, timeline)
+        self.levels: MaskLevels | None = None
+        if isinstance(path, OneMask):
+            self._source, self._timeline = path, None
+        elif is_pattern(path := Path(path)):
+            self._source = pngs = PngMasks(path, size_px, labels)
+            self._timeline = _timeline_of_pngs(path, pngs, timeline)
         else:
-            self._source = pictures = VideoMasks(self.path, size_px, labels)
-            self._timeline = _timeline_of_video(self.path, pictures, timeline)
+            self._source = pictures = VideoMasks(path, size_px, labels)
+            self._timeline = _timeline_of_video(path, pictures, timeline)
         self._place = _place_of(self._timeline, self._source)
         self.count = self._source.count if self._timeline is None else self._timeline.count
-        self.levels: MaskLevels | None = None if labels else self._source.levels.levels
+        if not (labels or isinstance(self._source, OneMask)):
+            self.levels = self._source.levels.levels
         self._prepare = prepare
         self._previous: int | None = None
         self._ahead: _Ahead | None = None
@@ -106,6 +125,8 @@ class MaskReader:
         Raises:
             CaptureError: a label image cannot be decoded, has the wrong size or unknown values.
         """
+        if isinstance(self._source, OneMask):
+            return not self._source.image.any()
         if self._labels is None:
             return self.levels is None
         some = range(self.count // 2, self.count, max(1, self.count // _LOOKED_AT))
@@ -194,7 +215,7 @@ def _timeline_of_pngs(path: Path, source: PngMasks, video: Timeline | None) -> T
     return video
 
 
-def _place_of(timeline: Timeline | None, source: PngMasks | VideoMasks) -> Callable[[int], int | None]:
+def _place_of(timeline: Timeline | None, source: PngMasks | VideoMasks | OneMask) -> Callable[[int], int | None]:
     """Return the function that maps frames to the numbers of masks in the mask source."""
     if timeline is None:
         return lambda frame: frame
@@ -216,7 +237,10 @@ def _timeline_of_video(path: Path, source: VideoMasks, video: Timeline | None) -
 
 
 def open_masks(
-    source: CameraSource, size_px: tuple[int, int], *, prepare: Callable[[MaskImage], MaskImage] | None = None
+    source: CameraSource | FrameMasks,
+    size_px: tuple[int, int],
+    *,
+    prepare: Callable[[MaskImage], MaskImage] | None = None,
 ) -> tuple[MaskReader, MaskReader]:
     """Return readers of the upper and lower teeth masks of a camera; see `MaskReader`.
 
@@ -224,6 +248,9 @@ def open_masks(
         CaptureError: masks or video are missing, damaged or do not match.
         ValueError: the camera has no masks.
     """
+    if isinstance(source, FrameMasks):
+        held = [OneMask(source.frame, mask) for mask in source.masks]
+        return MaskReader(held[0], size_px, prepare=prepare), MaskReader(held[1], size_px, prepare=prepare)
     masks = source.masks
     if masks is None:
         raise ValueError(f"camera {source.name} has no masks")

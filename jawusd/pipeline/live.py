@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from contextlib import ExitStack
@@ -21,7 +20,7 @@ from jawusd.media import live_source
 from jawusd.pipeline.calibrate import sync_cameras
 from jawusd.pipeline.cameras import load_cameras
 from jawusd.pipeline.live_jaw import LiveFrame, LiveJaw, LiveSkin
-from jawusd.pipeline.picture_search import LEAST_FIT, arches_apart, masked_cameras, orientations
+from jawusd.pipeline.picture_search import LEAST_FIT, arches_apart, orientations, rough_masks
 from jawusd.pipeline.skin import SkinOptions
 from jawusd.pipeline.solve_videos import PreparedTeeth, VideoOptions, VideoShot
 from jawusd.pipeline.state import no_progress
@@ -321,9 +320,7 @@ class _Follower:
             apart = arches_apart(pictures, turns)
             if len(apart) < min(2, len(self._cameras)):
                 continue
-            with tempfile.TemporaryDirectory() as folder:
-                masked = masked_cameras(self._capture, apart, none, Path(folder))
-                near = self._teeth.search.at(masked, self._cameras, none, 0)
+            near = self._teeth.search.at(rough_masks(apart, none, 0), self._cameras, none, 0)
             if near is not None:
                 self._learn(pictures, near)
             if self._cutter is not None:

@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Generic, Protocol, TypeVar
 
 import numpy as np
 
 from jawusd.base.arrays import Array
 from jawusd.base.errors import TrackingError
-from jawusd.formats.capture import Bootstrap, CameraSource, Capture
+from jawusd.formats.capture import Bootstrap
 from jawusd.geometry import Camera, se3_inverse
-from jawusd.pipeline.segment_record import with_masks
 from jawusd.pipeline.state import Progress
 
 if TYPE_CHECKING:
+    from jawusd.media.masks import FrameMasks
     from jawusd.segmentation.picture import ColourFootage, Pictures
     from jawusd.segmentation.rows import Rows
 
@@ -50,7 +48,7 @@ class StartInFrame(Protocol[T_co]):
     """An estimate of the pose in one frame; see `tracking.region.picture_start`."""
 
     def at(
-        self, sources: Sequence[CameraSource], cameras: Mapping[str, Camera], offsets: Mapping[str, int], frame: int
+        self, masks: Sequence[FrameMasks], cameras: Mapping[str, Camera], offsets: Mapping[str, int], frame: int
     ) -> T_co | None:
         """Return the most likely pose in a frame with rough masks, or None."""
 
@@ -86,7 +84,7 @@ class PictureSearch(Generic[T]):
     """A search for the teeth in footage, without masks, or at picks.
 
     Attributes:
-        capture, footage: the capture, and the images of those of its cameras that have a video.
+        footage: the images of the cameras that have a video.
         cameras: the calibrated cameras that have a video, by name.
         offsets: frame offset by camera.
         near: estimates the pose in a frame from rough masks or picks.
@@ -94,7 +92,6 @@ class PictureSearch(Generic[T]):
             fits, 0 .. 1.
     """
 
-    capture: Capture
     footage: ColourFootage
     cameras: Mapping[str, Camera]
     offsets: Mapping[str, int]
@@ -155,11 +152,8 @@ class PictureSearch(Generic[T]):
         return out
 
     def _at(self, candidate: _Candidate) -> Start[T] | None:
-        known = {name: self.footage.number(name, candidate.frame) for name in candidate.rows}
-        numbers = {name: number for name, number in known.items() if number is not None}
-        with tempfile.TemporaryDirectory() as folder:
-            masked = masked_cameras(self.capture, candidate.rows, numbers, Path(folder))
-            near = self.near.at(masked, self.cameras, self.offsets, candidate.frame)
+        masks = rough_masks(candidate.rows, self.offsets, candidate.frame)
+        near = self.near.at(masks, self.cameras, self.offsets, candidate.frame)
         return None if near is None else Start(candidate.frame, *self.judged(candidate.frame, near), "search")
 
     def picked(self, picks: Bootstrap, frames: range, least_fit: float) -> Start[T]:
@@ -240,20 +234,11 @@ def _describe_failure(tried: Sequence[int], best: Start[T] | None, left: range) 
     return found
 
 
-def masked_cameras(
-    capture: Capture, rows: Mapping[str, Rows], numbers: Mapping[str, int], folder: Path
-) -> list[CameraSource]:
-    """Write detected arches as masks to a folder, numbered by each camera's own frames; return the cameras with masks.
+def rough_masks(rows: Mapping[str, Rows], offsets: Mapping[str, int], frame: int) -> list[FrameMasks]:
+    """Return the arches that were detected in the images of a frame as masks, by camera."""
+    from jawusd.media.masks import FrameMasks
 
-    Raises:
-        OutputError: a mask cannot be written.
-    """
-    from jawusd.segmentation.files import ARCHES, mask_path, write_mask
-
-    for name, found in rows.items():
-        for arch, mask in zip(ARCHES, found.masks, strict=True):
-            write_mask(mask_path(folder, name, arch, numbers[name]), mask)
-    return [camera for camera in with_masks(capture, folder).cameras if camera.name in rows]
+    return [FrameMasks(name, frame - offsets[name], found.masks) for name, found in rows.items()]
 
 
 def picks_outside(frame: int, frames: range) -> TrackingError:

@@ -173,7 +173,7 @@ class _Segmentation:
         follower = Follower(self._footage, self._cameras, self._tracker.scans, self._subject, self._pool)
         upper, lower = self._tracker.scans
         rows = ArchStart(self._meshes, (upper, lower), self._capture.anatomy.T_anatomical_skull, self._pool.map)
-        footage = self._capture, self._footage, self._cameras, self._offsets
+        footage = self._footage, self._cameras, self._offsets
         return follower, PictureSearch(*footage, rows, follower.start_at)
 
     def _advance(self, stage_name: str, done: int) -> None:

@@ -104,7 +104,7 @@ class VideoShot:
         )
         self._frames = shot.frames
         self.take = PictureTake(jaw, teeth.scans, teeth.axes, shot)
-        footage = capture, self.footage, self.cameras, offsets
+        footage = self.footage, self.cameras, offsets
         self._search: PictureSearch[Pose] = PictureSearch(*footage, teeth.search, self.take.begun)
 
     def _cuts(self, placed: Sequence[Camera], centre: Array, frames: range) -> Iterator[Cut]:

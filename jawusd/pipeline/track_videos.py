@@ -226,7 +226,7 @@ def track_videos(
     with ThreadPoolExecutor(jobs) as pool:
         rows = ArchStart(teeth, scans, capture.anatomy.T_anatomical_skull, pool.map)
         follower = Follower(footage, cameras, scans, subject, pool)
-        search = PictureSearch(capture, footage, cameras, offsets, rows, follower.start_at)
+        search = PictureSearch(footage, cameras, offsets, rows, follower.start_at)
         if capture.bootstrap is None:
             begin = follower.start_by(search, frames, progress)
         else:

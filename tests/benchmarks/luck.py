@@ -29,7 +29,6 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 
@@ -37,10 +36,13 @@ import av
 import cv2
 import numpy as np
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "support"))
+from turned_cameras import turned
+
 from jawusd.cameras.calibration import save_calibration
 from jawusd.formats.capture import Bootstrap, Capture, load_capture
 from jawusd.formats.tracks import LOST, Tracks
-from jawusd.geometry import Camera, transform_point
+from jawusd.geometry import transform_point
 from jawusd.pipeline.calibrate import sync_cameras
 from jawusd.pipeline.cameras import load_cameras
 from jawusd.pipeline.subject import load_meshes, subject_of_capture
@@ -105,18 +107,6 @@ def rewritten(
             made.mux(out.encode(frame))
         made.mux(out.encode(None))
     return len(pictures)
-
-
-def turned(camera: Camera) -> Camera:
-    """Return a camera whose image is turned counter-clockwise by a quarter: (x, y) becomes (y, width - 1 - x)."""
-    turn = np.eye(4)
-    turn[:2, :2] = [[0.0, 1.0], [-1.0, 0.0]]
-    (fx, _, cx), (_, fy, cy), _ = camera.K
-    K = np.array([[fy, 0.0, cy], [0.0, fx, camera.size_px[0] - 1 - cx], [0.0, 0.0, 1.0]])
-    lens = np.array(camera.distortion)
-    if len(lens):
-        lens[2:4] = -lens[3], lens[2]
-    return replace(camera, size_px=camera.size_px[::-1], K=K, distortion=lens, T_cam_world=turn @ camera.T_cam_world)
 
 
 def mounted(capture: Capture, names: Sequence[str], turns: Mapping[str, int], folder: Path) -> Capture:

@@ -15,7 +15,7 @@ from subjects.annotator import write_mask
 import jawusd
 from jawusd.base.errors import CaptureError
 from jawusd.media.clip import Timeline
-from jawusd.media.masks import MaskReader, mask_size_px
+from jawusd.media.masks import FrameMasks, MaskReader, mask_size_px, open_masks
 from jawusd.media.pictures import read_gray
 from jawusd.media.writers import VideoWriter
 
@@ -228,3 +228,14 @@ def test_pictures_lie_in_folders_of_any_name(tmp_path):
     package = Path(jawusd.__file__).parent
     by_name = re.compile(r"cv2\.(imread|imwrite|VideoC|VideoW)")
     assert [path for path in package.rglob("*.py") if by_name.search(path.read_text())] == []
+
+
+def test_masks_in_memory_are_read_like_files(pattern: Path) -> None:
+    camera = FrameMasks("cam0", 4, np.stack([mask(4), np.zeros_like(mask(4))]))
+    upper, lower = open_masks(camera, SIZE)
+    with MaskReader(pattern, SIZE) as files:
+        assert np.array_equal(upper.read(4), files.read(4))
+    assert upper.read(3) is None and upper.read(5) is None and lower.read(4) is None
+    assert lower.is_black and not upper.is_black
+    prepared, _ = open_masks(camera, SIZE, prepare=lambda image: image[::2])
+    assert prepared.read_some(3, 6)[1].shape == (SIZE[1] // 2, SIZE[0])

@@ -7,7 +7,6 @@ import pytest
 
 from jawusd.base.errors import TrackingError
 from jawusd.geometry import Camera, make_transform, so3_exp
-from jawusd.pipeline import picture_search
 from jawusd.pipeline.picture_search import LEAST_FIT, PictureSearch, orientations
 from jawusd.pipeline.state import no_progress
 from jawusd.segmentation.rows import Rows
@@ -49,7 +48,6 @@ def searched(monkeypatch):
         return APART if turns == UPRIGHT["turns"] else None
 
     monkeypatch.setattr("jawusd.segmentation.rows.tooth_rows", rows)
-    monkeypatch.setattr(picture_search, "masked_cameras", lambda *given: [])
 
     def run(fit_of, upright=0, progress=no_progress):
         UPRIGHT["turns"] = upright
@@ -60,7 +58,8 @@ def searched(monkeypatch):
             return None if fit_of(frame) is None else "pose"
 
         rows = SimpleNamespace(at=near)
-        search = PictureSearch(None, footage, CAMERAS, {}, rows, lambda frame, pose: (pose, fit_of(frame)))
+        offsets = dict.fromkeys(CAMERAS, 0)
+        search = PictureSearch(footage, CAMERAS, offsets, rows, lambda frame, pose: (pose, fit_of(frame)))
         try:
             return search.run(TAKE, progress), tried, footage
         except TrackingError as error:

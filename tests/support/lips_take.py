@@ -1,4 +1,4 @@
-"""Takes in which lips close over the teeth: pictures of the synthetic studio, picks, calibration, truth; no masks."""
+"""Takes of the synthetic studio with their truth and without masks: lips that close over the teeth, or many looks."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from looks import TintedRenderer, draw_look, plain_look
 from subjects.scanner import Scanner, encoded
 
 from jawusd.cameras.calibration import save_calibration
@@ -18,12 +19,10 @@ from jawusd.synthetic.anatomy import build_anatomy
 from jawusd.synthetic.annotations import choose_picks
 from jawusd.synthetic.kinematics import smoothstep
 from jawusd.synthetic.person import Person
-from jawusd.synthetic.render import Renderer
-from jawusd.synthetic.take import FPS, Scene, build_cameras, perform
+from jawusd.synthetic.take import FPS, Scene, perform
 
 ROWS = ("upper", "lower")
 EVERY = 28  # frames from one closing to the next
-_NOISE = 1.3  # of the sensor [grey levels of 255]
 _SHARE_STEP = 4  # pixels of a picture per pixel in which what is in sight is counted
 _OPEN_MM = 3.0  # how much wider than at its narrowest the jaw may be open where lips close
 
@@ -68,50 +67,65 @@ def closed_lips(take, incisor, share, rng):
 
 
 def write_lips_capture(folder, seed, frames=100, size_px=(640, 360)):
-    """Write capture.toml, scans, calibration, videos, and truth/truth.npz with what is in sight of both arches."""
-    folder, rng = Path(folder), np.random.default_rng([seed, 0x11B5])
-    person, cameras = Person(seed), build_cameras(size_px)
-    with Renderer(cameras) as renderer:
+    """Write a take in which the lips close over the teeth, with picks; see `write_take`."""
+    return write_take(Path(folder), f"lips_{seed}", seed, frames, plain_look(size_px), True)
+
+
+def write_look_capture(folder, seed):
+    """Write every fifth frame of a take of a drawn look, without picks; see `write_take`."""
+    return write_take(Path(folder), f"look_{seed}", seed, 60, draw_look(seed), False, 5)
+
+
+def write_take(folder, name, seed, frames, look, lips_close, every=1):
+    """Write capture.toml, scans, calibration, videos, and truth/truth.npz with what is in sight of both arches.
+
+    Picks are written if the lips close. Only every so many of the frames are written.
+    """
+    rng, person, cameras = np.random.default_rng([seed, 0x11B5]), Person(seed), look.cameras
+    with TintedRenderer(look) as renderer:
         anatomy = build_anatomy(person)
         take = perform(person, anatomy.occlusion, frames, (0,) * len(cameras), seed)
         first = take.tracked[0] - take.first_instant
-        rows = np.arange(first, first + frames)
+        rows = np.arange(first, first + frames, every)
         incisor = person.joint.incisor
         opening = incisor[1] - transform_points(take.T_skull_mandible[rows], incisor[None])[:, 0, 1]
-        share = np.zeros(len(take.phase))
-        share[rows], spans = closing(frames, rng, opening)
-        take = closed_lips(take, incisor, share, rng)
+        share, spans = np.zeros(len(take.phase)), np.zeros((0, 2), int)
+        if lips_close:
+            share[rows], spans = closing(frames, rng, opening)
+            take = closed_lips(take, incisor, share, rng)
         scene = Scene(person, anatomy, renderer)
         head = take.T_world_skull[rows]
         jaw = head @ take.T_skull_mandible[rows]
-        arches = (anatomy.upper, anatomy.lower)
-        things = scene.occluders(take, first)
-        picks = [choose_picks(arch, T, cameras, things, 4, 1.0, rng) for arch, T in zip(arches, (head[0], jaw[0]))]
-        in_sight = np.zeros((frames, 2, len(cameras)))
+        arches, picks = (anatomy.upper, anatomy.lower), None
+        if lips_close:
+            things = scene.occluders(take, first)
+            picks = [choose_picks(arch, T, cameras, things, 4, 1.0, rng) for arch, T in zip(arches, (head[0], jaw[0]))]
+        in_sight = np.zeros((len(rows), 2, len(cameras)))
+        sizes_px = [camera.size_px[:: -1 if turns % 2 else 1] for camera, turns in zip(cameras, look.turns)]
         with contextlib.ExitStack() as stack:
             videos = [
-                stack.enter_context(VideoWriter(folder / "video" / f"{c.name}.mp4", size_px, FPS, quality_crf=20))
-                for c in cameras
+                stack.enter_context(VideoWriter(folder / "video" / f"{c.name}.mp4", size, FPS / every, quality_crf=20))
+                for c, size in zip(cameras, sizes_px)
             ]
             for f, row in enumerate(rows):
                 poses = scene.pose(take, row)
                 for c, camera in enumerate(cameras):
                     picture = scene.draw(c, take, row, poses, None)
-                    noisy = picture.color + rng.normal(0.0, _NOISE, picture.color.shape)
-                    videos[c].write(np.clip(np.rint(noisy), 0, 255).astype(np.uint8))
+                    developed = np.rot90(look.developed(picture.color, rng), look.turns[c])
+                    videos[c].write(np.ascontiguousarray(developed))
                     seen = [int((mask > 127).sum()) for mask in (picture.upper, picture.lower)]
                     in_sight[f, :, c] = seen / np.maximum(_bare_px(arches, (head[f], jaw[f]), camera), 1.0)
     scanner = Scanner("ply", "painted", 0, 0.0, False)
-    for name, arch in zip(ROWS, arches):
-        write_bytes_atomic(folder / "scans" / f"{name}_teeth.ply", encoded(arch.mesh, scanner))
-    save_calibration(folder / "calibration.toml", cameras)
+    for row, arch in zip(ROWS, arches):
+        write_bytes_atomic(folder / "scans" / f"{row}_teeth.ply", encoded(arch.mesh, scanner))
+    save_calibration(folder / "calibration.toml", look.placed())
     truth = {
-        "frames": np.arange(frames), "T_world_upper": head, "T_world_lower": jaw, "in_sight": in_sight,
+        "frames": np.arange(len(rows)), "T_world_upper": head, "T_world_lower": jaw, "in_sight": in_sight,
         "T_upper_lower": take.T_skull_mandible[rows], "closings": np.array(spans), "closed": share[rows],
         "landmark_names": np.array(LANDMARKS), "landmarks": person.landmarks,
     }  # fmt: skip
     write_npz_atomic(folder / "truth" / "truth.npz", truth)
-    write_text_atomic(folder / "capture.toml", described(f"lips_{seed}", FPS, frames, cameras, picks))
+    write_text_atomic(folder / "capture.toml", described(name, FPS / every, len(rows), cameras, picks))
     return folder / "capture.toml"
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Protocol, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,7 @@ from jawusd.formats.capture import CameraSource
 from jawusd.formats.finding import Finding
 from jawusd.geometry import Camera
 from jawusd.media.mask_survey import ARCHES, odd_pictures, survey_masks
-from jawusd.media.masks import open_masks
+from jawusd.media.masks import FrameMasks, open_masks
 from jawusd.media.working_view import WorkingView
 
 #: Minimum number of cameras if the depth of the teeth is determined only by masks.
@@ -24,6 +24,10 @@ FEWEST_CAMERAS = 2
 #: Minimum number of masks of an arch in one frame. With one view, depth depends on the size of the outline, which a
 #: wrong mask changes.
 FEWEST_MASKS = 2
+
+#: Camera whose masks are files, or are in memory.
+MaskSource: TypeAlias = CameraSource | FrameMasks
+AnySource = TypeVar("AnySource", bound=MaskSource)
 
 _BORDER_PX = 20  # margin of a view around the masks [px]: more than the widest search
 # Number of frames buffered when iterating backwards, at most (about 20 MB), and at first, since frames are often
@@ -85,7 +89,7 @@ class MaskViews:
 
     def __init__(
         self,
-        sources: Sequence[CameraSource],
+        sources: Sequence[MaskSource],
         cameras: Mapping[str, Camera],
         offsets: Mapping[str, int],
         centre_world: Array,
@@ -108,7 +112,8 @@ class MaskViews:
         """
         self._stack = ExitStack()
         self._masked = masked = masked_sources(sources, cameras, offsets, fewest)
-        self._sizes = [(s, cameras[s.name].size_px if s.masks else (0, 0)) for s in sources]
+        self._files = [s for s in sources if isinstance(s, CameraSource)]
+        self._sizes = {s.name: cameras[s.name].size_px for s in self._files if s.masks}
         self.cameras = tuple(cameras[s.name] for s in masked)
         self._offsets = [offsets[s.name] for s in masked]
         self._working, self._readers = [], []
@@ -130,10 +135,13 @@ class MaskViews:
 
     def findings(self) -> list[Finding]:
         """Return findings about the masks read so far, and about cameras without masks."""
-        out = [finding for source, size in self._sizes for finding in survey_masks(source, size)]
+        out = []
+        for file in self._files:
+            out += survey_masks(file, self._sizes.get(file.name, (0, 0)))
         for source, pair in zip(self._masked, self._readers, strict=True):
-            for arch, reader in zip(ARCHES, pair, strict=True):
-                out += odd_pictures(source, arch, reader.odd)
+            if isinstance(source, CameraSource):
+                for arch, reader in zip(ARCHES, pair, strict=True):
+                    out += odd_pictures(source, arch, reader.odd)
         return out
 
     def at(self, frame: int) -> list[View]:
@@ -183,11 +191,11 @@ def present_masks(views: Sequence[View]) -> Mask:
 
 
 def masked_sources(
-    sources: Sequence[CameraSource],
+    sources: Sequence[AnySource],
     cameras: Mapping[str, Camera],
     offsets: Mapping[str, int],
     fewest: int = FEWEST_CAMERAS,
-) -> tuple[CameraSource, ...]:
+) -> tuple[AnySource, ...]:
     """Return the cameras with masks that are not all black.
 
     Raises:

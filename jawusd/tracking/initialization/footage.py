@@ -15,7 +15,7 @@ from jawusd.formats.capture import CameraSource
 from jawusd.geometry import Camera, triangulate
 from jawusd.media.masks import open_masks
 from jawusd.media.working_view import WorkingView
-from jawusd.tracking.contour.views import FEWEST_CAMERAS, MaskViews
+from jawusd.tracking.contour.views import FEWEST_CAMERAS, MaskSource, MaskViews
 
 _BESIDE = 2  # number of surveyed frames on either side of a chosen frame to skip as redundant
 # Maximum ratio of the area of a plausible mask to that of masks known to be correct: an opening mouth shows more teeth.
@@ -30,11 +30,16 @@ class Footage:
     `offsets` are time offsets by camera name: the reference frame number minus the camera's own frame number.
     """
 
-    sources: Sequence[CameraSource]
+    sources: Sequence[MaskSource]
     cameras: Mapping[str, Camera]
     offsets: Mapping[str, int]
     frames: tuple[int, int] | None
     fewest: int = FEWEST_CAMERAS  # minimum number of cameras with masks of both arches
+
+    @property
+    def files(self) -> list[CameraSource]:
+        """The cameras whose masks are files."""
+        return [source for source in self.sources if isinstance(source, CameraSource)]
 
     def survey(self, frames: tuple[int, int] | None, count: int) -> MaskSurvey:
         """Measure the masks of `count` evenly spaced frames, by default from the whole footage."""
@@ -101,7 +106,7 @@ class MaskSurvey:
 
 
 def survey_masks(
-    sources: Sequence[CameraSource],
+    sources: Sequence[MaskSource],
     cameras: Mapping[str, Camera],
     offsets: Mapping[str, int],
     frames: tuple[int, int] | None,

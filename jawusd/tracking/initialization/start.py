@@ -153,7 +153,7 @@ def fit_without_a_camera(
 
 def _check_upright(search: StartSearch, footage: Footage, frame: int, found: SearchResult) -> None:
     """Reject masks that fit better with the arches swapped: an upside-down upper arch resembles a lower one."""
-    exchange = all_arches_exchanged(footage.sources)
+    exchange = all_arches_exchanged(footage.files)
     try:
         other = search.at(replace(footage, sources=exchange.sources), frame)
     except TrackingError:

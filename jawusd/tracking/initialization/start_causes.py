@@ -80,7 +80,7 @@ def likely_exchange(footage: Footage, solver: ContourSolver, poses: Array, frame
     if not (given >= _ODD_SHARE).any():
         return None
     found: list[tuple[float, float, MaskExchange]] = []
-    for exchange in possible_exchanges(footage.sources):
+    for exchange in possible_exchanges(footage.files):
         if _sizes_differ(footage, exchange.sources):
             continue
         try:
@@ -120,8 +120,8 @@ def _with_masks(sources: Sequence[CameraSource], masks: dict[int, Masks]) -> tup
 
 def _sizes_differ(footage: Footage, sources: Sequence[CameraSource]) -> bool:
     """Return whether masks would be assigned to a camera with another image size."""
-    size = {_masks(source).upper: footage.cameras[source.name].size_px for source in footage.sources}
-    size |= {_masks(source).lower: footage.cameras[source.name].size_px for source in footage.sources}
+    size = {_masks(source).upper: footage.cameras[source.name].size_px for source in footage.files}
+    size |= {_masks(source).lower: footage.cameras[source.name].size_px for source in footage.files}
     return any(size[_masks(source).upper] != footage.cameras[source.name].size_px for source in sources)
 
 
@@ -279,7 +279,7 @@ def _exchanges(search: StartSearch, footage: Footage) -> Iterator[_Cause]:
     """Yield swaps of masks and of calibrations."""
     if len(footage.sources) > _MOST_CAMERAS:
         return
-    for exchange in possible_exchanges(footage.sources):
+    for exchange in possible_exchanges(footage.files):
         yield _Cause(exchange.finding, exchange.hint, search, replace(footage, sources=exchange.sources))
     for a, b in combinations([source.name for source in footage.sources], 2):
         if footage.offsets[a] != footage.offsets[b]:  # with equal offsets, this is identical to a swap of masks

@@ -10,9 +10,10 @@ import numpy as np
 from jawusd.base.arrays import Array
 from jawusd.base.errors import TrackingError
 from jawusd.evaluator import JawRig
-from jawusd.formats.capture import Bootstrap, CameraSource
+from jawusd.formats.capture import Bootstrap
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry import Camera
+from jawusd.media.masks import FrameMasks
 from jawusd.tracking.config import Mapper, TrackingConfig
 from jawusd.tracking.contour.scan import ARCH_NAMES, Scan
 from jawusd.tracking.contour.solver import ContourSolver
@@ -71,17 +72,17 @@ class ArchStart:
         return np.stack([pose_from_picks(picks, mesh.vertices, cameras, name)[0] for mesh, name, picks in table])
 
     def at(
-        self, sources: Sequence[CameraSource], cameras: Mapping[str, Camera], offsets: Mapping[str, int], frame: int
+        self, masks: Sequence[FrameMasks], cameras: Mapping[str, Camera], offsets: Mapping[str, int], frame: int
     ) -> Array | None:
         """Return the most likely poses in a frame with rough masks, shape (2, 4, 4), or None.
 
         Args:
-            sources: two or more cameras with masks of that frame.
+            masks: masks of that frame, of two or more cameras.
             cameras, offsets: calibrations and time offsets by camera name; an offset is the reference frame number
                 minus the camera's own.
             frame: frame number of the reference camera.
         """
-        masked = masked_sources(sources, cameras, offsets, 2)
+        masked = masked_sources(masks, cameras, offsets, 2)
         try:
             return self._search.at(Footage(masked, cameras, offsets, (frame, frame + 1), 2), frame).poses
         except TrackingError:
@@ -126,19 +127,19 @@ class PictureStart:
         return self._coordinates.pose_of(self._rows.picked(bootstrap, cameras))
 
     def at(
-        self, sources: Sequence[CameraSource], cameras: Mapping[str, Camera], offsets: Mapping[str, int], frame: int
+        self, masks: Sequence[FrameMasks], cameras: Mapping[str, Camera], offsets: Mapping[str, int], frame: int
     ) -> Pose | None:
         """Return the most likely pose in a frame with rough masks of one or more cameras, or None.
 
         Args:
-            sources: cameras with masks of that frame.
+            masks: masks of that frame, of one or more cameras.
             cameras, offsets: calibrations and time offsets by camera name; an offset is the reference frame number
                 minus the camera's own.
             frame: frame number of the reference camera.
         """
-        if len(sources) > 1:
-            poses = self._rows.at(sources, cameras, offsets, frame)
+        if len(masks) > 1:
+            poses = self._rows.at(masks, cameras, offsets, frame)
             return None if poses is None else self._coordinates.pose_of(poses)
-        masked = masked_sources(sources, cameras, offsets, 1)
+        masked = masked_sources(masks, cameras, offsets, 1)
         found = self._single.at(Footage(masked, cameras, offsets, (frame, frame + 1), 1), frame)
         return None if found is None else found.pose
