@@ -99,7 +99,7 @@ class PictureSearch(Generic[T]):
     judged: Callable[[int, T], tuple[T, float]]
 
     def run(self, frames: range, progress: Progress, up_world: Array | None = None) -> Start[T]:
-        """Return the first start that fits clearly, or else the best one among some frames and one head orientation.
+        """Return the first start that fits clearly, or else the best one among some frames.
 
         `up_world` is the up direction of the head in the world, shape (3,), if known from other frames. If it is given,
         one camera orientation is tried and, with several cameras, the first start that fits is returned, because it
@@ -131,8 +131,8 @@ class PictureSearch(Generic[T]):
                         best = found
                     if best is not None and best.fit >= clear:
                         return best
-                if best is not None and best.fit >= LEAST_FIT:
-                    return best
+            if best is not None and best.fit >= LEAST_FIT:
+                return best
             if len(tried) >= _MOST_TRIED:
                 break
         raise TrackingError(
