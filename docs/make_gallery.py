@@ -184,6 +184,12 @@ def browser_page(size_px: tuple[int, int]) -> Iterator[Any]:
         yield page
 
 
+def let_draw(page: Any) -> None:
+    """Wait until the page has drawn what it was sent, on a busy machine too."""
+    page.wait_for_timeout(DRAWN_MS)
+    page.evaluate("new Promise(drawn => requestAnimationFrame(() => requestAnimationFrame(drawn)))")
+
+
 @contextlib.contextmanager
 def viewed(out: Path, size_px: tuple[int, int]) -> Iterator[tuple[Viewer, Any]]:
     """Open the page of `jawusd view` in Chromium, and yield its server and the page."""
@@ -219,7 +225,7 @@ def report(out: Path, folder: Path) -> Path:
     """Photograph the top of the report of a build."""
     with browser_page((1200, 900)) as page:
         page.goto((out / "report.html").resolve().as_uri())
-        page.wait_for_timeout(DRAWN_MS)
+        let_draw(page)
         picture = page.screenshot()
     return save_webp(folder / "report.webp", Image.open(io.BytesIO(picture)), 1100)
 
@@ -231,15 +237,15 @@ def phone(out: Path, folder: Path) -> Path:
         page.goto((Path(made) / "jaw.html").as_uri())
         page.wait_for_selector("#jaw[data-clearance]", state="attached")
         page.locator('[data-jaw="d1"]').evaluate("(e) => { e.value = 16; e.dispatchEvent(new Event('input')); }")
-        page.wait_for_timeout(DRAWN_MS)
+        let_draw(page)
         picture = page.screenshot()
     return save_webp(folder / "phone.webp", Image.open(io.BytesIO(picture)), 390)
 
 
-def footage(out: Path, folder: Path) -> Path:
+def footage(out: Path, folder: Path, frames: tuple[int, int] = FOOTAGE_FRAMES) -> Path:
     """Draw the teeth that are tracked in the example's footage without its masks."""
     with tempfile.TemporaryDirectory() as made:
-        capture_of(Path(made) / "footage", FOOTAGE_FRAMES, 3, masks=False)
+        capture_of(Path(made) / "footage", frames, 3, masks=False)
         run_jawusd("track", Path(made) / "footage", "-o", Path(made) / "tracks.npz")
         capture, tracks = load_capture(Path(made) / "footage"), load_tracks(Path(made) / "tracks.npz")
         offsets, scans = sync_cameras(capture, no_progress)["offsets"], tracked_scans(capture, tracks)
@@ -258,7 +264,7 @@ def viewer(out: Path, folder: Path) -> Path:
         shown.motion.show(float(VIEWED_FRAME))
         if shown.footage is not None:
             page.wait_for_selector("img:visible")
-        page.wait_for_timeout(4000)  # jaw and footage are drawn
+        let_draw(page)
         picture = page.screenshot()
     return save_webp(folder / "viewer.webp", Image.open(io.BytesIO(picture)), 1200)
 
@@ -277,7 +283,7 @@ def jaw(out: Path, folder: Path, step: int = STEP) -> Path:
         camera.position, camera.look_at = tuple(target + JAW_FROM_MM), tuple(target)
         for frame in range(*JAW_FRAMES, step):
             served.show(clip.at(frame))
-            page.wait_for_timeout(DRAWN_MS)
+            let_draw(page)
             picture = page.screenshot(clip={"x": left, "y": 0, "width": width, "height": height})
             pictures.append(Image.open(io.BytesIO(picture)).convert("RGB"))
     path = folder / "jaw.webp"
