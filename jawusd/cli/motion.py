@@ -77,7 +77,7 @@ def _read_motion(rig: JawRig, source: Path) -> AuthoredMotion:
             "is an npz file; expected key frames, or a table of d values or poses.",
             hint="`jawusd encode` writes the d values of tracks as a table.",
         )
-    if source.suffix.lower() == ".json" and source.read_bytes().lstrip()[:1] == b"{":
+    if source.suffix.lower() == ".json" and source.is_file() and source.read_bytes().lstrip()[:1] == b"{":
         keys = load_keys(source)
         key_frames, _ = keys.arrays()
         at = np.unique(np.concatenate([np.arange(np.ceil(key_frames[0]), np.floor(key_frames[-1]) + 1), key_frames]))

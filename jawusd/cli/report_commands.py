@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import signal
 from collections.abc import Iterator
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -171,10 +170,7 @@ def view(
     allow: Allow = None,
 ) -> None:
     """View and animate a rig in the browser; or view the footage of a capture, to inspect poses and set picks."""
-    from jawusd.pipeline.state import changed_files
-    from jawusd.pipeline.view import is_capture
-
-    capture = rig is not None and is_capture(rig)
+    capture = _is_capture(rig)
     if tracks is not None and not capture:
         raise typer.BadParameter("--tracks needs a capture, not a rig.")
     if prim is not None and capture:
@@ -185,13 +181,28 @@ def view(
         _write_page(rig, page, force, prim, footage)
         return
     _warn_of_host(host, capture)
-    for folder in (rig, tracks):
-        for found in changed_files(folder) if folder is not None and folder.is_dir() else ():
-            say(found.line(), err=True)
+    _name_changed_files(*(folder for folder in (rig, tracks) if folder is not None and folder.is_dir()))
     if rig is not None and capture:
         _serve_capture(rig, tracks, host, port, browser, allow_outside)
     else:
         _serve_rig(rig, host, port, prim, browser, play)
+
+
+def _is_capture(rig: Path | None) -> bool:
+    if rig is None:
+        return False
+    from jawusd.pipeline.view import is_capture
+
+    return is_capture(rig)
+
+
+def _name_changed_files(*folders: Path) -> None:
+    """Print which files of builds have changed since."""
+    for folder in folders:
+        from jawusd.pipeline.state import changed_files
+
+        for found in changed_files(folder):
+            say(found.line(), err=True)
 
 
 def _serve_capture(
@@ -211,15 +222,19 @@ def _serve_capture(
 
 def _serve_rig(rig: Path | None, host: str, port: int, prim: str | None, browser: bool, play: bool) -> None:
     """Serve the page of a rig, or of the example rig, which is valid, so that a browser can start before it is read."""
-    from jawusd.pipeline.view import open_viewer
+    from jawusd.viewer.address import FirstPage
 
-    announce = partial(_announce, browser)
     viewer = None
     try:
         with _interrupts_held():
-            viewer = open_viewer(rig, host, port, prim, play=play, opened=announce if rig is None else None)
-        if rig is not None:
-            announce(viewer.url)
+            first = FirstPage(host, port) if rig is None else None
+            if first is not None:
+                _announce(browser, first.url)
+            from jawusd.pipeline.view import open_viewer  # takes a second, while the browser loads the page
+
+            viewer = open_viewer(rig, host, port, prim, play=play, first=first)
+        if first is None:
+            _announce(browser, viewer.url)
         viewer.wait()
     except KeyboardInterrupt:
         if viewer is not None:
@@ -251,9 +266,8 @@ def _announce(browser: bool, url: str) -> None:
 def _write_page(rig: Path | None, page: Path, force: bool, prim: str | None, footage: bool) -> None:
     """Write the web page of a rig that needs no server."""
     from jawusd.pipeline.pose_page import write_page
-    from jawusd.pipeline.view import is_capture
 
-    if rig is not None and is_capture(rig):
+    if _is_capture(rig):
         raise typer.BadParameter("--page needs a rig, not a capture.")
     refuse_existing(page, force)
     write_page(rig, page, prim, footage=footage)
@@ -262,7 +276,7 @@ def _write_page(rig: Path | None, page: Path, force: bool, prim: str | None, foo
 
 def _warn_of_host(host: str, capture: bool) -> None:
     """Warn if the viewer's address can be reached from other machines."""
-    from jawusd.viewer.server import is_loopback
+    from jawusd.viewer.address import is_loopback
 
     if not is_loopback(host):
         may = "write picks into the capture" if capture else "write animations beside the rig"

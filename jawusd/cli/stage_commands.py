@@ -78,7 +78,9 @@ def encode(
     }
     judged = judged_motion(loaded, frames, d, residual_mm)
     result = {**judged, "file": str(out), "poses": len(d), "encoded": int(known.sum()), "residual_mm": size}
-    head = f"{out}: {result['encoded']} of {len(d)} poses, residual {size}"
+    head = f"{out}: {result['encoded']} of {len(d)} poses"
+    if residual.size:
+        head += f", {residual.mean():.3f} mm from the model on average, {residual.max():.3f} mm at most"
     still = still_lines(judged["moved_mm"], len(d)) if holds_stage(poses) else []
     emit(result, as_json, lambda: [head, *judged_lines(judged)[1:], *still])
 

@@ -34,6 +34,8 @@ from jawusd.geometry.so3 import wxyz_from_matrix
 MATRIX_COLUMNS = tuple(f"m{row}{column}" for row in range(4) for column in range(4))
 QUATERNION_COLUMNS = ("tx", "ty", "tz", "qw", "qx", "qy", "qz")
 PARAMETER_COLUMNS = ("d1", "d2", "d3")
+#: A file of animation keys, for messages.
+KEYS_EXAMPLE = '{"fps": 24, "keys": [{"frame": 1, "d": [0, 0, 0]}]}'
 _MAX_BYTES = 1 << 30
 # Maximum deviation of a matrix from a rigid transform; matrices written with 5 decimals stay below it.
 _RIGID_TOLERANCE = 1e-3
@@ -77,14 +79,17 @@ def _header_hint(table: TextTable) -> str:
     if len(table.header) == 1 and len(table.header[0].split()) > 1:
         return "Separate the columns by commas."
     if "d" in lower:
-        return 'Write keys as {"fps": 24, "keys": [{"frame": 1, "d": [0, 0, 0]}]}.'
+        return f"Write keys as {KEYS_EXAMPLE}."
+    if {"tx", "rx"} <= lower:
+        return "Write rotations as quaternions qw, qx, qy, qz, or poses as matrices m00 ... m33."
     return "Name the columns frame, d1, d2, d3: opening, laterotrusion and protrusion in mm."
 
 
 def _json_table(path: Path) -> TextTable:
     records = parse_json(read_text(path, _MAX_BYTES), path)
     if not isinstance(records, list) or not all(isinstance(record, dict) for record in records):
-        raise FormatError("must be a JSON list of objects, one per frame.", path=path)
+        what = 'a list with an object for each frame, such as [{"frame": 1, "d1": 20, "d2": 2, "d3": 1}]'
+        raise FormatError(f"must be {what}, or keys: {KEYS_EXAMPLE}.", path=path)
     if not records:
         raise FormatError("is empty.", path=path)
     names = list(records[0])
@@ -112,7 +117,9 @@ def _numbers(table: TextTable, names: tuple[str, ...]) -> Array:
 
 def _frames(table: TextTable, name: str) -> NDArray[np.int64]:
     if name not in table.header:
-        raise FormatError(f'has no column "{name}"; it has {_listed(table)}.', path=table.path)
+        timed = {"time", "timecode", "seconds"} & {column.lower() for column in table.header}
+        hint = "Number the rows in a column frame, instead of giving times." if timed else None
+        raise FormatError(f'has no column "{name}"; it has {_listed(table)}.', path=table.path, hint=hint)
     values = _numbers(table, (name,))[:, 0]
     uneven = np.flatnonzero((values != np.round(values)) | (np.abs(values) > 2**53))
     if uneven.size:

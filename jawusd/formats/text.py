@@ -64,6 +64,8 @@ def parse_json(text: str, path: Path) -> object:
     Raises:
         FormatError: the text is not JSON.
     """
+    if not text.strip():
+        raise FormatError("is empty.", path=path)
     try:
         return json.loads(text)
     except json.JSONDecodeError as error:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable
 from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -22,6 +21,7 @@ from jawusd.pipeline.state import recorded_verdict
 
 if TYPE_CHECKING:
     from jawusd.meshes.contact import ContactMap, Teeth
+    from jawusd.viewer.address import FirstPage
     from jawusd.viewer.motion import Clip
     from jawusd.viewer.server import Viewer
     from jawusd.viewer.viewed import ViewedActor, ViewedFootage
@@ -45,13 +45,13 @@ def open_viewer(
     prim: str | None = None,
     *,
     play: bool = True,
-    opened: Callable[[str], None] | None = None,
+    first: FirstPage | None = None,
 ) -> Viewer:
     """Serve the rig at a path to browsers; for further errors, see `viewed_actor`.
 
     Args:
         play: whether pages play the captured take, if there is one, when they are opened.
-        opened: called with the address once it can be opened, before the rig is read.
+        first: has served the page on the address so far.
 
     Raises:
         MissingDependencyError: the viewer is not installed.
@@ -59,7 +59,7 @@ def open_viewer(
     """
     from jawusd.viewer.server import Viewer
 
-    return Viewer(partial(viewed_actor, path, prim), host, port, play=play, opened=opened)
+    return Viewer(partial(viewed_actor, path, prim), host, port, play=play, first=first)
 
 
 def viewed_actor(path: str | os.PathLike[str] | None, prim: str | None = None) -> ViewedActor:

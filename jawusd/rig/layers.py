@@ -231,13 +231,25 @@ def without_warning(words: str) -> Iterator[None]:
             Tf.Warn(commentary)
 
 
+def check_layer_name(path: Path) -> None:
+    """Check the suffix of a layer, since OpenUSD writes text into files of any other name.
+
+    Raises:
+        OutputError: The name does not end in .usda, .usdc or .usd.
+    """
+    if path.suffix.lower() not in (".usda", ".usdc", ".usd"):
+        raise OutputError("the name of a USD layer must end in .usdc, .usda or .usd.", path=path)
+
+
 def write_layer(layer: Sdf.Layer, path: Path) -> Path:
     """Write a layer to a file atomically, and reload the file's layer if it is open in this process.
 
     Raises:
-        OutputError: The file cannot be written, or OpenUSD does not support its path.
+        OutputError: The file cannot be written, its name does not end in .usda, .usdc or .usd, or OpenUSD does not
+            support its path.
     """
     path = Path(path)
+    check_layer_name(path)
     check_path(path, OutputError)
     with atomic_path(path) as temporary:
         try:

@@ -65,8 +65,11 @@ def actor_in_folder(path: Path) -> Path:
     """Return the actor file in the folder of a built or published rig; return other paths unchanged.
 
     Raises:
-        RigError: The folder has no actor file.
+        RigError: The folder has no actor file, or the file describes a capture.
     """
+    build = f"This is a capture. Build a rig from it: jawusd build {path} -o out"
+    if path.suffix == ".toml" and path.is_file():
+        raise RigError("is not a rig.", path=path, hint=build)
     if not path.is_dir():
         return path
     actor = path / ACTOR_FILE
@@ -76,7 +79,7 @@ def actor_in_folder(path: Path) -> Path:
     if not actor.exists():
         hint = "Give the folder of a build (jawusd build ... -o FOLDER), or a file in it."
         if (path / "capture.toml").exists():
-            hint = f"This is a capture. Build a rig from it: jawusd build {path} -o out"
+            hint = build
         raise RigError(f"is a folder without {ACTOR_FILE}.", path=path, hint=hint)
     return actor
 

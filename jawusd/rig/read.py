@@ -17,7 +17,15 @@ from jawusd.base.guard import out_of_memory
 from jawusd.base.inputs import check_path
 from jawusd.evaluator import JawRig
 from jawusd.rig.attributes import key_times, read_arrays, read_value, upgrade_rig, value_of, was_upgraded
-from jawusd.rig.layout import MODEL_HASH_KEY, ONNX_ATTRIBUTES, PARAMETERS, has_jaw_api, meshes_below, rig_prims
+from jawusd.rig.layout import (
+    ACTOR_FILE,
+    MODEL_HASH_KEY,
+    ONNX_ATTRIBUTES,
+    PARAMETERS,
+    has_jaw_api,
+    meshes_below,
+    rig_prims,
+)
 from jawusd.rig.table import DecoderTable
 from jawusd.rig.untrusted import open_checked, raises_format_error
 
@@ -73,7 +81,9 @@ def find_rig_prim(stage: Usd.Stage, where: object, prim_path: str | None = None)
         return prim
     prims = rig_prims(stage)
     if not prims:
-        raise FormatError("has no jaw rig (no prim with JawRigAPI).", path=str(where))
+        actor = Path(str(where)).with_name(ACTOR_FILE)
+        hint = f"Give {actor}." if actor.is_file() and actor != Path(str(where)) else None
+        raise FormatError("has no jaw rig (no prim with JawRigAPI).", path=str(where), hint=hint)
     if len(prims) > 1:
         names = ", ".join(str(prim.GetPath()) for prim in prims)
         raise FormatError(f"has several jaw rigs: {names}.", path=str(where), hint="Choose one with --prim.")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import NamedTuple, ParamSpec, TypeVar
@@ -56,6 +57,7 @@ VALUE_ERRORS = (
 MAX_CPU_S = 20
 _ALLOW = "If you trust it, allow its folder with --allow or the environment variable JAWUSD_ALLOW."
 _UNREADABLE = "is not a USD file that OpenUSD can read"
+_SUFFIXES = (".usda", ".usdc", ".usd", ".usdz")
 #: Maximum number of prims and properties in a layer, and of samples of an attribute.
 MAX_SPECS, MAX_SAMPLES = 2_000_000, 1_000_000
 _MAX_LAYER_READS = 20_000  # maximum number of reads; a layer is read once for each set of variables
@@ -111,9 +113,12 @@ def open_checked(path: Path) -> Usd.Stage:
 
 def _unreadable(file: Path, error: BaseException | None = None) -> str:
     """Return the message for an unreadable file, with OpenUSD's reason, such as the line of a syntax error."""
+    if file.suffix.lower() not in _SUFFIXES:
+        return f"is not a USD file; the name of a USD file ends in {', '.join(_SUFFIXES)}."
     details = error.args if isinstance(error, Tf.ErrorException) else ()
     reason = next((str(each.commentary).strip() for each in details if getattr(each, "commentary", "")), "")
     reason = reason.replace(f"{file.absolute()}:", "line ", 1)
+    reason = re.sub(r": parse error matching [^ ]*pegtl.*", ": the text is wrong here, or ends too early", reason)
     return f"{_UNREADABLE}: {reason:.300}" if reason else f"{_UNREADABLE}."
 
 

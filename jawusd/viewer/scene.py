@@ -59,32 +59,47 @@ def add_lights(scene: viser.SceneApi, up: tuple[float, float, float]) -> None:
     scene.add_light_hemisphere("/light", ground_color=_GROUND, intensity=_AMBIENT, wxyz=turned)
 
 
+def add_jaw(scene: viser.SceneApi, actor: ViewedActor) -> tuple[viser.FrameHandle, dict[str, viser.MeshHandle]]:
+    """Draw skull and jaw in occlusion; return the frame of the jaw and its meshes, by the names in `MOVING`."""
+    T_world_skull = np.array(actor.rig.T_anatomical_skull)
+    for name in STILL:
+        if name in actor.meshes:
+            mesh = actor.meshes[name]
+            placed = Mesh(transform_points(T_world_skull, mesh.vertices), mesh.faces)
+            _add_mesh(scene, f"/{name}", placed, _color(name, actor), _SKULL_OPACITY if name == "skull" else None)
+    jaw = scene.add_frame("/jaw", show_axes=False)
+    parts = {}
+    for name in MOVING:
+        if name in actor.meshes:
+            opacity = _CLEAR if name in actor.placeholders else None
+            parts[name] = _add_mesh(scene, f"/jaw/{name}", actor.meshes[name], _color(name, actor), opacity)
+    return jaw, parts
+
+
+def _color(name: str, actor: ViewedActor) -> Color:
+    return _PLACEHOLDER if name in actor.placeholders else _COLORS.get(name, _BONE)
+
+
+def _add_mesh(scene: viser.SceneApi, name: str, mesh: Mesh, color: Color, opacity: float | None) -> viser.MeshHandle:
+    # Two-sided faces take twice as long to render; only open meshes need them.
+    side: Literal["front", "double"] = "front" if is_solid(mesh) else "double"
+    return scene.add_mesh_simple(name, mesh.vertices, mesh.faces, color=color, opacity=opacity, side=side)
+
+
 class JawScene:
     """3-D scene of one page: first only skull and jaw, then `add_marks`; `grips` are the meshes that can be dragged."""
 
     def __init__(self, client: viser.ClientHandle, actor: ViewedActor) -> None:
         """Draw skull and jaw in occlusion."""
         self._client, self._scene = client, client.scene
-        rig = actor.rig
-        self._T_world_skull = np.array(rig.T_anatomical_skull)
-        self._rest = rest_places(rig)
-        for name in STILL:
-            if name in actor.meshes:
-                mesh = actor.meshes[name]
-                placed = Mesh(transform_points(self._T_world_skull, mesh.vertices), mesh.faces)
-                color = _PLACEHOLDER if name in actor.placeholders else _COLORS.get(name, _BONE)
-                self._add_mesh(f"/{name}", placed, color, _SKULL_OPACITY if name == "skull" else None)
-        self._jaw = self._scene.add_frame("/jaw", show_axes=False)
-        moving = [name for name in MOVING if name in actor.meshes]
-        self._moving = {name: actor.meshes[name] for name in moving}
+        self._T_world_skull = np.array(actor.rig.T_anatomical_skull)
+        self._rest = rest_places(actor.rig)
+        self._jaw, parts = add_jaw(client.scene, actor)
+        self._moving = {name: actor.meshes[name] for name in parts}
         self._ghosts: list[viser.FrameHandle] = []
-        self._bone = _PLACEHOLDER if "mandible" in actor.placeholders else _BONE
-        self.grips = []
-        for name in moving:
-            opacity = _CLEAR if name in actor.placeholders else None
-            color = _COLORS.get(name, self._bone)
-            self.grips.append(self._add_mesh(f"/jaw/{name}", actor.meshes[name], color, opacity))
-        self._mandible = self.grips[moving.index("mandible")] if "mandible" in moving else None
+        self._bone = _color("mandible", actor)
+        self.grips = list(parts.values())
+        self._mandible = parts.get("mandible")
         self._inside = True
 
     def add_marks(self, actor: ViewedActor) -> None:
@@ -96,11 +111,6 @@ class JawScene:
         self._line = self._lines("/pull", np.zeros((1, 2, 3)), _HELD)
         self.show_grab(None, None)
         self.show_pins({})
-
-    def _add_mesh(self, name: str, mesh: Mesh, color: Color, opacity: float | None) -> viser.MeshHandle:
-        # Two-sided faces take twice as long to render; only open meshes need them.
-        side: Literal["front", "double"] = "front" if is_solid(mesh) else "double"
-        return self._scene.add_mesh_simple(name, mesh.vertices, mesh.faces, color=color, opacity=opacity, side=side)
 
     def _add_landmarks(self, landmarks: Array) -> None:
         for name, place in zip(LANDMARKS, landmarks, strict=True):
@@ -163,7 +173,7 @@ class JawScene:
         ghost = self._scene.add_frame(name, show_axes=False)
         for part in ("mandible", "lower_teeth"):
             if part in self._moving:
-                self._add_mesh(f"{name}/{part}", self._moving[part], _COLORS.get(part, self._bone), _FAINT)
+                _add_mesh(self._scene, f"{name}/{part}", self._moving[part], _COLORS.get(part, self._bone), _FAINT)
         return ghost
 
     def move(self, T_skull_mandible: Array, inside: bool) -> None:

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import ipaddress
 import logging
 import math
-import socket
 import sys
 import time
 from abc import ABC, abstractmethod
@@ -19,9 +17,10 @@ from urllib.parse import urlsplit
 import viser
 
 from jawusd.base.arrays import Array
-from jawusd.base.errors import OutputError
+from jawusd.viewer.address import FirstPage, check_address, is_loopback, url_of
 from jawusd.viewer.page import Page, StaticPlots, begin_page
-from jawusd.viewer.scene import set_first_view
+from jawusd.viewer.readouts import rest_places
+from jawusd.viewer.scene import add_jaw, set_first_view
 from jawusd.viewer.viewed import ViewedActor
 from jawusd.viewer.widgets import set_theme
 
@@ -82,23 +81,31 @@ class _Closable(Protocol):
 class PageServer(ABC):
     """Server with one page per visitor; `pages` are the open pages by client number; `url` is the address to open."""
 
-    def __init__(self, name: str, host: str, port: int) -> None:
+    def __init__(self, name: str, host: str, port: int, first: FirstPage | None = None) -> None:
         """Start serving on a port: 0 selects any free port; instead of a port in use, the next free one is taken.
+
+        Args:
+            first: has served the page on the address so far; its port is taken instead of `port`.
 
         Raises:
             OutputError: the address does not belong to this machine.
         """
         self._host = host
         self.pages: dict[int, _Closable] = {}
-        _check_address(host)
+        check_address(host)
         with contextlib.redirect_stdout(sys.stderr):  # viser prints a greeting, but stdout is for results
+            port = port if first is None else first.release()
             self._server = _LocalServer(host=host, port=port, label=name, verbose=False)
         logging.getLogger("websockets.server").addFilter(_WITHOUT_TRACEBACK)  # a filter is added only once
         self._server.get_event_loop().set_exception_handler(_report_task)
         set_theme(self._server.gui)
         self._server.on_client_connect(self._connected)
         self._server.on_client_disconnect(self._disconnected)
-        self.url = f"http://{'localhost' if is_loopback(host) else host}:{self._server.get_port()}"
+        self.url = url_of(host, self._server.get_port())
+        if first is not None:
+            if first.url != self.url:
+                log.warning("another program has taken that port; open %s instead", self.url)
+            first.close()
 
     async def _connected(self, client: viser.ClientHandle) -> None:
         if not self._trusted(client):
@@ -146,25 +153,23 @@ class Viewer(PageServer):
         port: int,
         *,
         play: bool = True,
-        opened: Callable[[str], None] | None = None,
+        first: FirstPage | None = None,
     ) -> None:
         """Start to serve an actor; see `PageServer`. Further errors are those of `load`, after which nothing is served.
 
         Args:
             load: returns the actor; called once the server accepts visitors, who wait for it.
             play: whether a new page plays the captured take.
-            opened: called with the address before `load`, so that a browser can start meanwhile.
         """
         self._play = play
         self._shown_s = -math.inf
         self._loaded: Future[None] = Future()
-        super().__init__("jawusd", host, port)
+        super().__init__("jawusd", host, port, first)
         try:
-            if opened is not None:
-                opened(self.url)
             self._actor = load()
+            set_first_view(self._server, rest_places(self._actor.rig))
+            add_jaw(self._server.scene, self._actor)  # pages have it before their own scene, which replaces it
             self._static = StaticPlots(self._actor.rig)
-            set_first_view(self._server, self._static.rest)
             self._loaded.set_result(None)
         except BaseException:
             self._loaded.cancel()
@@ -200,16 +205,6 @@ def wait_until_drawn(client: viser.ClientHandle) -> None:
             client.local_storage.get_item("drawn", _PATIENCE_S)
 
 
-def is_loopback(host: str) -> bool:
-    """Return whether an address is reachable only from this machine."""
-    if host == "localhost":
-        return True
-    try:
-        return ipaddress.ip_address(host.strip("[]")).is_loopback
-    except ValueError:
-        return False
-
-
 def is_own_page(host: str, origin: str | None, local: bool) -> bool:
     """Return whether a connection comes from a page of this server.
 
@@ -222,20 +217,3 @@ def is_own_page(host: str, origin: str | None, local: bool) -> bool:
     if local and not is_loopback(name):
         return False
     return origin is None or urlsplit(origin).netloc == host
-
-
-def _check_address(host: str) -> None:
-    """Check that an address can be bound; otherwise, viser would search for a free port forever.
-
-    Raises:
-        OutputError: the address cannot be bound.
-    """
-    try:
-        family, kind, protocol, _, address = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)[0]
-        with socket.socket(family, kind, protocol) as probe:
-            probe.bind(address)
-    except OSError as error:
-        raise OutputError(
-            f"cannot listen on {host}: {error.strerror}.",
-            hint="Use the default, 127.0.0.1, to serve browsers on this machine.",
-        ) from error

@@ -45,7 +45,7 @@ class Work:
     pins: tuple[Pin, ...] = ()
     keys: KeyTrack = ()
     fps: float = DEFAULT_FPS
-    interpolation: Interpolation = "linear"
+    interpolation: Interpolation = "smooth"
 
 
 class Session:

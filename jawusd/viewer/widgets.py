@@ -26,7 +26,7 @@ MOST_BYTES = 8 << 20
 _MOST_LETTERS = 80  # maximum length of a file name in messages [characters]
 
 
-def set_theme(gui: viser.GuiApi, dark: bool = False) -> None:
+def set_theme(gui: viser.GuiApi, dark: bool = True) -> None:
     """Widen the controls of a page, or of all later pages of a server, and hide viser's logo and share button."""
     gui.configure_theme(control_width="large", show_logo=False, show_share_button=False, dark_mode=dark)
 
@@ -49,8 +49,8 @@ def begin_panel(client: viser.ClientHandle, name: str) -> None:
 
 
 def add_dark_checkbox(client: viser.ClientHandle) -> None:
-    """Add the checkbox for dark mode."""
-    box = client.gui.add_checkbox("dark page", False)
+    """Add the checkbox for dark mode, which is on at first."""
+    box = client.gui.add_checkbox("dark page", True)
 
     async def darken(_: object) -> None:
         set_theme(client.gui, box.value)

@@ -3,9 +3,13 @@
 Each gives one message without a traceback, with the wrong argument and a remedy.
 """
 
+import shutil
+
 import pytest
 from capture_texts import HEAD, TABLES, write_media
 from run_jawusd import program
+
+from jawusd.rig.layout import EXAMPLE_RIG
 
 CAPTURE = f'{HEAD}calibration = "cal.toml"\n{TABLES}'
 
@@ -30,9 +34,21 @@ def place(tmp_path_factory):
     text = CAPTURE.replace('"left.mp4"', '"plates/lefft.####.exr"')
     (folder / "sequence" / "capture.toml").write_text(text.replace('"plates', '"../plates'))
     (folder / "spaces in.toml").write_text("this is no TOML")
+    shutil.copytree(EXAMPLE_RIG.parent, folder / "rig")
+    text = (folder / "rig" / "actor.usda").read_text()
+    (folder / "rig" / "half.usda").write_text(text[:300])
+    for name, content in MOTIONS.items():
+        (folder / name).write_text(content)
     return folder
 
 
+MOTIONS = {
+    "motion.csv": "frame,d1,d2,d3\n0,0,0,0\n10,20,0,0\n",
+    "times.csv": "time,d1,d2,d3\n0.0,0,0,0\n0.5,20,0,0\n",
+    "angles.csv": "frame,tx,ty,tz,rx,ry,rz\n0,0,0,0,0,0,0\n",
+    "lists.json": "[[0, 0, 0, 0], [10, 20, 0, 0]]",
+    "nothing.json": "",
+}
 MISTAKES = [
     ("a capture that is not there", ["check", "nowhere"], ["there is no such file", "nowhere"]),
     ("a folder without capture.toml", ["check", "empty"], ["there is no such file", "jawusd init"]),
@@ -49,6 +65,16 @@ MISTAKES = [
         ["pose", "empty", "--d", "1,2,3"],
         ["without actor.usda", "Give the folder of a build"],
     ),
+    ("the file of a capture in place of a rig", ["info", "capture.toml"], ["This is a capture", "jawusd build"]),
+    ("the meshes in place of a rig", ["info", "rig/geo.usdc"], ["has no jaw rig", "Give rig/actor.usda"]),
+    ("keys in place of a rig", ["info", "lists.json"], ["is not a USD file", ".usda, .usdc"]),
+    ("half of a rig", ["info", "rig/half.usda"], ["half.usda", "line ", "ends too early"]),
+    ("keys that are not there", ["animate", "rig", "keys.json"], ["keys.json: there is no such file"]),
+    ("keys of nothing", ["animate", "rig", "nothing.json"], ["nothing.json: is empty"]),
+    ("keys as lists", ["animate", "rig", "lists.json"], ["an object for each frame", '"d1": 20']),
+    ("times in place of frames", ["animate", "rig", "times.csv"], ['no column "frame"', "instead of giving times"]),
+    ("angles in place of a quaternion", ["animate", "rig", "angles.csv"], ["as quaternions qw, qx, qy, qz"]),
+    ("an animation as a video", ["animate", "rig", "motion.csv", "-o", "a.mp4"], ["must end in .usdc, .usda or .usd"]),
     ("a rig that is not there", ["info", "out/actor.usda"], ["out/actor.usda"]),
     ("a video in place of a rig", ["info", "left.mp4"], ["left.mp4"]),
     ("two numbers of three", ["pose", "u.ply", "--d", "20,2"], ["needs three numbers", "--d"]),

@@ -43,6 +43,8 @@ def test_encode_writes_parameters_that_pose_back(actor, tmp_path):
     np.testing.assert_array_equal(found_frames, frames)
     np.testing.assert_allclose(found, d, atol=1e-6)
     assert "--force" in run("encode", actor, tmp_path / "poses.csv", "-o", tmp_path / "d.csv", code=10)
+    said = run("encode", actor, tmp_path / "poses.csv", "-o", tmp_path / "d.csv", "--force")
+    assert f"{len(frames)} of {len(frames)} poses, 0.000 mm from the model on average, 0.000 mm at most" in said
 
 
 def test_validate_judges_poses_and_leaves_with_a_no(actor, tmp_path):

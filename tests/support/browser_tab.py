@@ -90,8 +90,8 @@ class Tab:
     def keep_every_tab(self, name, names):
         """Save a picture of each tab, light and dark; return widths (of the page, of the screen) of all of them."""
         widths = []
-        for scheme in ("light", "dark"):
-            if scheme == "dark":
+        for scheme in ("dark", "light"):
+            if scheme == "light":
                 self.tab(names[0])
                 self.web.get_by_label("dark page").click()
             for one in names:

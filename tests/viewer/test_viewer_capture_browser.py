@@ -245,7 +245,7 @@ def test_tracked_poses_are_drawn_and_the_plot_is_a_timeline(chromium, example_bu
     tab.web.get_by_label("dark page").click()
     tab.press("3-D")
     tab.settle()
-    tab.picture("capture_dark")
+    tab.picture("capture_light")
     tab.web.close()
     viewer.stop()
     assert tab.complaints == [] and tab.elsewhere == []

@@ -3,6 +3,7 @@
 import contextlib
 import logging
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -15,7 +16,8 @@ from run_jawusd import heed_signals
 
 from jawusd.base.errors import FormatError, OutputError
 from jawusd.pipeline.view import open_viewer, viewed_actor
-from jawusd.viewer.server import Viewer, is_loopback, is_own_page, wait_until_drawn
+from jawusd.viewer.address import FirstPage, is_loopback
+from jawusd.viewer.server import Viewer, is_own_page, wait_until_drawn
 
 
 @pytest.mark.parametrize(
@@ -51,23 +53,76 @@ def test_an_address_of_another_machine_is_refused(folder):
         open_viewer(folder, "192.0.2.1", 0)
 
 
-def test_the_address_is_known_before_the_rig_is_read_and_closed_if_it_cannot_be(folder):
+def asked(page, request):
+    """Return a connection to a page with a request sent."""
+    connection = socket.create_connection(("127.0.0.1", page.port), timeout=60)
+    connection.sendall(f"{request}\r\nHost: localhost\r\n".encode())
+    connection.sendall(b"\r\n")
+    return connection
+
+
+def test_the_page_is_served_before_viser_is_imported_and_the_rig_read(folder):
+    first = FirstPage("127.0.0.1", 0)
+    with urllib.request.urlopen(first.url, timeout=60) as page:
+        early = page.read()
+    held = asked(first, "GET / HTTP/1.1\r\nUpgrade: websocket")
     told = []
 
     def load():
-        assert len(told) == 1
-        with urllib.request.urlopen(told[0], timeout=60) as page:
-            assert page.status == 200
+        assert held.recv(1) == b""  # closed once viser listens
+        with urllib.request.urlopen(first.url, timeout=60) as page:
+            told.append(page.read())
         return viewed_actor(folder)
 
-    viewer = Viewer(load, "127.0.0.1", 0, opened=told.append)
+    viewer = Viewer(load, "127.0.0.1", 0, first=first)
     viewer.stop()
-    assert told == [viewer.url]
+    held.close()
+    assert told == [early] and b"Viser" in early and viewer.url == first.url
+
+
+def test_nothing_is_served_after_a_rig_that_cannot_be_read(folder):
     (folder / "actor.usda").write_text("#usda 1.0\n")
+    first = FirstPage("127.0.0.1", 0)
     with pytest.raises(FormatError):
-        open_viewer(folder, "127.0.0.1", 0, opened=told.append)
+        open_viewer(folder, "127.0.0.1", 0, first=first)
     with pytest.raises(urllib.error.URLError):
-        urllib.request.urlopen(told[1], timeout=60)
+        urllib.request.urlopen(first.url, timeout=60)
+
+
+def test_the_first_page_takes_the_next_free_port_and_idle_connections_do_not_block_it():
+    first = FirstPage("127.0.0.1", 0)
+    idle = socket.create_connection(("127.0.0.1", first.port), timeout=60)
+    second = FirstPage("127.0.0.1", first.port)
+    assert second.port > first.port
+    for page in (first, second):
+        with urllib.request.urlopen(page.url, timeout=60) as answer:
+            assert answer.status == 200
+        page.release()
+        page.close()
+    idle.close()
+    with pytest.raises(OutputError, match="cannot listen on 192.0.2.1"):
+        FirstPage("192.0.2.1", 0)
+
+
+def test_a_port_that_another_program_takes_in_between_is_named(folder, caplog):
+    class Robbed(FirstPage):
+        def release(self):
+            port = super().release()
+            self.thief = socket.create_server(("127.0.0.1", port))
+            return port
+
+    first = Robbed("127.0.0.1", 0)
+    viewer = open_viewer(folder, "127.0.0.1", 0, play=False, first=first)
+    viewer.stop()
+    first.thief.close()
+    (warning,) = [record.getMessage() for record in caplog.records if record.levelno == logging.WARNING]
+    assert viewer.url in warning and viewer.url != first.url
+
+
+def test_without_viser_no_address_is_printed(monkeypatch):
+    monkeypatch.setattr("jawusd.viewer.address.find_spec", lambda name: None)
+    with pytest.raises(ModuleNotFoundError, match="viser"):
+        FirstPage("127.0.0.1", 0)
 
 
 def test_panels_wait_for_the_drawn_jaw_but_not_forever():

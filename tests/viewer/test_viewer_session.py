@@ -127,7 +127,7 @@ def test_undo_and_redo_walk_through_every_kind_of_change(session):
         lambda: session.set_parameter(0, 10.0),
         lambda: session.set_pin("condyle_left", True),
         lambda: session.add_key(0),
-        lambda: session.set_interpolation("smooth"),
+        lambda: session.set_interpolation("linear"),
         lambda: session.set_fps(30.0),
         lambda: session.load_keys(Keys(fps=12, keys=(Key(frame=3, d=(1, 0, 0)),))),
     ):
