@@ -135,7 +135,6 @@ def first_pass(
     Args:
         offsets: frame offset by camera.
     """
-    from jawusd.paper.take import track_capture_paper
     from jawusd.tracking import track_capture
     from jawusd.tracking.region.condyle_fusion import widen_strained
 
@@ -144,6 +143,8 @@ def first_pass(
         upper, lower = meshes["upper_teeth"], meshes["lower_teeth"]
         report = partial(progress, "track")
         if solver == "paper":
+            from jawusd.paper.take import track_capture_paper  # needs torch, which takes seconds to import
+
             tracks = track_capture_paper(
                 capture,
                 cameras,
