@@ -227,9 +227,9 @@ def _crash(name: str) -> ResourceError:
     if name == "SIGXCPU":
         found, hint = "takes too much processor time to read: the file is damaged or malicious.", ""
     elif name == "SIGKILL":
-        found, hint = "the program was killed by the system (out of memory) or by a user while using this.", _MORE
+        found, hint = "the program was killed here, by the system (out of memory) or by a user.", _MORE
     else:
-        found = f"a library crashed while using this ({name}): the file is damaged, or memory ran out."
+        found = f"a library crashed here ({name}): the file is damaged, or memory ran out."
         hint = "Run `jawusd -v COMMAND` to see where."
     return ResourceError(found, path=current_file(), hint=hint or None)
 

@@ -142,4 +142,4 @@ def _load(path: Path, _: Mapping[str, Size]) -> list[Camera]:
     return load_calibration(path)
 
 
-FORMAT = CameraFormat(lambda path: 0, _load)  # of all files that no other format reads
+FORMAT = CameraFormat(lambda path: 0, _load)  # the fallback for files that no other format reads

@@ -252,7 +252,7 @@ def _formats() -> list[CameraFormat]:
 
 
 def _format_of(path: Path) -> CameraFormat:
-    return max(_formats(), key=lambda one: one.reads(path))  # the first one of equals: `calibration`
+    return max(_formats(), key=lambda one: one.reads(path))  # in a tie, the first one: `calibration`
 
 
 def load_cameras_file(

@@ -69,7 +69,7 @@ class Flashes:
 
 
 def find_steps(brightness: Array, first_frame: int = 0) -> list[Step]:
-    """Return the light steps in temporal order; none if the brightness changes less than in a flash.
+    """Return the light steps in temporal order; none if no change is as large as that of a flash.
 
     Args:
         brightness: mean brightness of successive images, 0 to 255, shape (n,).

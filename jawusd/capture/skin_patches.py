@@ -1,4 +1,4 @@
-"""Working images of the skin, and how well and where their patches agree."""
+"""Working images of the skin, and correlation and tracking of their patches."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from jawusd.media.working_view import WorkingView
 
 Gray = NDArray[np.uint8]
 
-_PX_PER_MM = 6.0  # largest working resolution; finer texture than that of pores is not needed
+_PX_PER_MM = 6.0  # maximum working resolution; texture finer than pores is not needed
 _WINDOW_MM, _LEVELS = 5.0, 3  # side of the patch around a point, and levels of the pyramid above the working image
 _LEAST_SIDE_PX = 13
-_BACK_PX = 0.7  # largest distance between a point and where following it forth and back leads
+_BACK_PX = 0.7  # maximum forward-backward error of a tracked point
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,13 +123,13 @@ class Patches:
 
 
 def warped(image: Gray, H: Array, shape: tuple[int, ...]) -> Gray:
-    """Return an image at the pixels to which a homography (3, 3) maps those of an image of some shape (h, w)."""
+    """Resample an image to a shape (h, w) by a homography (3, 3) from pixels of the result to the image."""
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     return np.asarray(cv2.warpPerspective(image, H, (shape[1], shape[0]), flags=flags), np.uint8)
 
 
 def homography(camera: Camera, other: Camera, T_world_mouth: Array, normal: Array, front_mm: float) -> Array:
-    """Return the map (3, 3) from pixels of one pinhole camera to those of another, by a plane in front of the mouth."""
+    """Return the homography (3, 3) from one pinhole camera to another that a plane in front of the mouth induces."""
     T = camera.T_cam_world @ T_world_mouth
     n = T[:3, :3] @ normal
     distance = float(n @ transform_point(T, np.array([0.0, 0.0, front_mm])))

@@ -18,24 +18,25 @@ from jawusd.capture.skin_patches import Gray, Patches, SkinView, alike, followed
 from jawusd.geometry import Camera, se3_inverse, so3_exp, transform_points
 from jawusd.media.pixels import ColourPicture
 
-_MOST_POINTS, _APART_MM, _LEAST_POINTS = 250, 2.5, 20  # per camera, their smallest distance, and least number in all
+# Maximum number of points per camera, their minimum distance, and minimum number of all points.
+_MOST_POINTS, _APART_MM, _LEAST_POINTS = 250, 2.5, 20
 _QUALITY = 0.01  # smallest eigenvalue of the gradients around a point, relative to the best point of the image
 _REACH_MM = 75.0  # distance from the mouth within which points are searched for
-# Half the width of the lips, and their height above the upper and below the lower incisal edge [mm]; lips have no
-# texture that stays.
+# Half the width of the lips, and their height above the upper and below the lower incisal edge [mm]; the texture of
+# lips is not stable.
 _LIPS_MM, _LIPS_FRONT_MM = (36.0, 15.0), 6.0
-# Smallest correlation of a patch with that of the key frame for aligning both, and for following it from frame to
-# frame; and smallest correlation between two cameras.
+# Minimum correlation of a patch with the key frame for aligning it, and for following it from frame to frame; and
+# minimum correlation between two cameras.
 _ALIKE, _STILL_ALIKE, _ALIKE_ACROSS = 0.8, 0.5, 0.75
-_OFF_PX = 1.5  # largest distance between a point and the projection of its position in space
-_MOST_ANGLE = np.deg2rad(60.0)  # between the optical axes of two cameras in which a point can be recognised
+_OFF_PX = 1.5  # maximum distance between a point and the projection of its triangulated position
+_MOST_ANGLE = np.deg2rad(60.0)  # maximum angle between the optical axes of two cameras whose points are matched
 # Planes by which the skin is approximated where points are matched between cameras: distances in front of the incisal
 # point [mm], and turns to the left and upwards.
 _DEPTHS_MM, _TURNS = np.arange(16.0, -48.0, -1.0), np.deg2rad([[0, 0], [35, 0], [-35, 0], [0, -35]])
-_SHIFT_PX = 4.0  # largest distance of a point from where the best of these planes puts it
-_STEP_PX = 6.0  # largest distance of a point from where its neighbours or the frame before put it
+_SHIFT_PX = 4.0  # maximum distance of a point from its position predicted by the best plane
+_STEP_PX = 6.0  # maximum distance of a point from its position predicted by its neighbours or the previous frame
 _RIDGE_PX2 = 50.0
-_AROUND, _OFF_MM = 8, 5.0  # number of neighbours of a point, and its largest distance in depth from their median
+_AROUND, _OFF_MM = 8, 5.0  # number of neighbours of a point, and maximum difference of its depth from their median
 
 
 class SkinTracker:
@@ -79,7 +80,7 @@ class SkinTracker:
                 f"{len(self.points_world)} points on the skin around the mouth are recognised in two cameras; at least "
                 f"{_LEAST_POINTS} are needed.",
                 hint="The skin needs texture that the cameras resolve: freckles, stubble, or painted dots of 1 to 2 "
-                "mm. Film sharply, closely and without glare, with cameras at most 60 degrees apart.",
+                "mm. Film from close up, in focus and without glare, with cameras at most 60 degrees apart.",
             )
 
     def _matched(self, a: int, T_world_mouth: Array) -> Array:
@@ -134,9 +135,9 @@ class SkinTracker:
         return found
 
     def placed(self, pixels: Array) -> tuple[Array, Array]:
-        """Return positions in space (N, 3) [mm] of points with working pixels (C, N, 2), and the pixels that fit them.
+        """Triangulate points with working pixels (C, N, 2); return positions (N, 3) [mm], and the consistent pixels.
 
-        Points that fewer than two cameras see, or that no position fits, are NaN.
+        Points that fewer than two cameras see, or whose pixels are inconsistent, are NaN.
         """
         kept = pixels.copy()
         for _ in range(max(len(pixels) - 1, 1)):
@@ -230,7 +231,7 @@ def _beside(start: Array, moved: Array, good: Mask, lost: Indices) -> Array:
 
     Args:
         start, moved: positions in the key frame and in the image, shape (N, 2) each.
-        good: points whose position in the image is right, shape (N,).
+        good: points whose position in the image is reliable, shape (N,).
         lost: indices of the other points, shape (L,).
     """
     known = np.flatnonzero(good)
@@ -241,7 +242,7 @@ def _beside(start: Array, moved: Array, good: Mask, lost: Indices) -> Array:
         arms = start[known] - start[index]
         near = np.argsort((arms**2).sum(axis=1))[:_AROUND]
         design = np.column_stack([np.ones(_AROUND), arms[near]])
-        # a small weight on the gradient, which points on a line do not determine
+        # a small penalty on the gradient, which collinear points do not determine
         normal = design.T @ design + np.diag([0.0, _RIDGE_PX2, _RIDGE_PX2])
         steps = (moved - start)[known[near]]
         out[k] = start[index] + np.linalg.solve(normal, design.T @ steps)[0]
@@ -262,7 +263,7 @@ def _without_outliers(points: Array, T_world_mouth: Array) -> Mask:
 
 
 def _distinct(points: Array, kept: Mask) -> Mask:
-    """Return which points (N, 3) are not closer than half the smallest distance to an earlier one that is kept."""
+    """Return which points (N, 3) are at least half the minimum distance away from all earlier points that are kept."""
     out = np.zeros(len(points), bool)
     for k in np.flatnonzero(kept):
         out[k] = not (np.linalg.norm(points[out] - points[k], axis=1) < _APART_MM / 2).any()

@@ -34,7 +34,7 @@ TakeArg = Annotated[
 FaceArg = Annotated[
     Path,
     typer.Argument(
-        help="The face of the same take: C3D, TRC or another marker table, the CSV of Live Link Face, or a CSV of "
+        help="Face data of the same take: C3D, TRC or another marker table, the CSV of Live Link Face, or a CSV of "
         "columns or points."
     ),
 ]

@@ -176,7 +176,7 @@ def view(
     if prim is not None and capture:
         raise typer.BadParameter("--prim needs a rig, not a capture.")
     if footage and page is None:
-        raise typer.BadParameter("--footage needs --page; the viewer shows footage by itself.")
+        raise typer.BadParameter("--footage needs --page; the viewer always shows footage.")
     if page is not None:
         _write_page(rig, page, force, prim, footage)
         return
@@ -221,7 +221,7 @@ def _serve_capture(
 
 
 def _serve_rig(rig: Path | None, host: str, port: int, prim: str | None, browser: bool, play: bool) -> None:
-    """Serve the page of a rig, or of the example rig, which is valid, so that a browser can start before it is read."""
+    """Serve the page of a rig, or of the example rig, whose address is announced before the rig is read."""
     from jawusd.viewer.address import FirstPage
 
     viewer = None

@@ -49,7 +49,7 @@ SkinFile = Annotated[
     ),
 ]
 FaceFile = Annotated[
-    Path | None, typer.Option(help="The face during the shot, as for skin-fit, with the points or columns of --skin.")
+    Path | None, typer.Option(help="Face data of the shot, as for skin-fit, with the points or columns of --skin.")
 ]
 FaceOffset = Annotated[
     float | None,
@@ -60,7 +60,7 @@ FaceOffset = Annotated[
 LiveFaceFile = Annotated[
     Path | None,
     typer.Option(
-        help="The live face with the points or columns of --skin: - for the standard input, a pipe or a growing CSV. "
+        help="Live face data with the points or columns of --skin: - (standard input), a pipe or a growing CSV. "
         "For recorded cameras, a recording as for skin-fit."
     ),
 ]

@@ -28,8 +28,8 @@ from jawusd.geometry.so3 import hat
 # x (k, 3) -> rotations (k, 3, 3), translations (k, 3), spatial derivatives (k, 6, 3)
 Derivative = Callable[[Array], tuple[Array, Array, Array]]
 
-# Weight of a distance along the line of sight relative to one across it. The weight matters only at the bound:
-# elsewhere, two equations across the sight and one along it determine d.
+# Weight of the depth of a handle along the viewing direction, relative to distances perpendicular to it. The weight
+# matters only at the bound: elsewhere, two perpendicular equations and one for the depth determine d.
 _DEPTH_WEIGHT = 0.1
 _MIN_PRECISION = 1e-12  # minimum precision of d in every direction, relative to the trace of the precision
 
@@ -81,7 +81,7 @@ class Handles(NamedTuple):
 
     @property
     def depths(self) -> Array:
-        """Return rows (m, 3) that map d to weighted offsets from the habitual path along the sight of each handle."""
+        """Return rows (m, 3) that map d to weighted offsets of the handles from the habitual path along `sight`."""
         if self.sight is None:
             return np.zeros((0, 3))
         # d2 and d3 displace the incisal point from the habitual path along the anatomical x and z axes
@@ -89,17 +89,17 @@ class Handles(NamedTuple):
         return _DEPTH_WEIGHT * self.vectors[3][:, None] * along
 
     def across(self, values: Array) -> Array:
-        """Return vectors (n, 3, m) or their derivatives (n, 3, m, 3) without their components along the sight."""
+        """Return vectors (n, 3, m) or their derivatives (n, 3, m, 3) without their components along `sight`."""
         if self.sight is None:
             return values
         along = np.einsum("am,nam...->nm...", self.sight, values)
         return values - np.einsum("am,nm...->nam...", self.sight, along)
 
     def features(self, images: Array, d: Array) -> Array:
-        """Return the features to compare: images (n, 3, m) [mm] across the sight, then the depths of d (n, 3) [mm].
+        """Return the features: images (n, 3, m) [mm] without depth, then the depths from d (n, 3) [mm].
 
         Returns:
-            Features [mm], shape (n, 3 m), or (n, 4 m) with a sight.
+            Features [mm], shape (n, 3 m), or (n, 4 m) if `sight` is given.
         """
         seen = self.across(images).reshape(len(images), 3 * self.vectors.shape[1])
         return seen if self.sight is None else np.concatenate([seen, d @ self.depths.T], axis=1)

@@ -38,7 +38,7 @@ LIMIT_SOFTNESS_MM = 4.0  # rounding of the kinks at both path limits
 # Length scale of the quadratic terms of rho, d2^2 / 10 mm; gives all coefficients a similar magnitude.
 ARCH_BOW_MM = 10.0
 DROP_BEND = 0.15  # second-order coefficient of the bent drop terms [1/mm]
-DROP_SATURATION_MM2 = 16.0  # squared distance, (4 mm)^2, beyond which the drop terms become straight
+DROP_SATURATION_MM2 = 16.0  # squared distance, (4 mm)^2, beyond which the drop terms become linear
 
 Arrays = Mapping[str, Sequence[float]]  # the named arrays of a rig, flattened row by row
 Numbers = tuple[object, ...]  # nested tuples of floats, or of their counterparts of another number type

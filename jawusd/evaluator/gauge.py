@@ -29,7 +29,8 @@ from jawusd.geometry.rodrigues import N, Triple
 
 INVERSE_TOLERANCE_MM = 1e-13
 INVERSE_ITERATIONS = 120
-# Number of iterations after which Newton's method counts as stalled; then steps double, or the bracket is halved.
+# Number of iterations after which Newton's method counts as stalled; from then on, steps are doubled or the bracket is
+# halved.
 PATIENCE = 8
 INVERSE_STEP_MM = 20.0
 MIN_INVERSE_SLOPE = 0.2  # lower limit of the derivative; smaller values would let Newton steps diverge from the root

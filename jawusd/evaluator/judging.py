@@ -207,7 +207,7 @@ class VerdictStream:
         """Return the verdict on the next pose (4, 4), taken at a time [s] later than that of the previous pose.
 
         Raises:
-            ValueError: a wrong shape, or a time that is not finite or not later.
+            ValueError: a wrong shape, or a time that is not finite or not later than the previous one.
         """
         T, time_s = as_floats(T_skull_mandible, "T_skull_mandible"), float(time_s)
         if T.shape != (4, 4):

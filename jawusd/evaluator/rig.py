@@ -261,11 +261,12 @@ class JawRig(RigJudging, RigAuthoring):
                 valid volume.
             weights: Weights of the handles, shape (H,), >= 0 and not all zero; default: equal.
             sight: Directions along which distances do not count, skull frame, of the shape of p_mandible; 0 for handles
-                whose whole distance counts. Along the sight the jaw follows the habitual path: in a frontal view d3
-                becomes 0, in a lateral view d2. From above or below, the sight leaves the opening undetermined.
+                whose whole distance counts. Along these directions, the jaw follows the habitual path: in a frontal
+                view d3 becomes 0, in a lateral view d2. Vertical directions leave the opening undetermined.
 
         Returns:
-            d, always inside the bound, and the weighted rms distance between handles and targets, across the sight.
+            d, always inside the bound, and the weighted rms distance between handles and targets, perpendicular to
+            `sight`.
 
         Raises:
             ValueError: wrong shapes or weights, or a sight that is not finite.

@@ -13,21 +13,21 @@ from jawusd.evaluator import JawRig
 from jawusd.formats.arkit import shares_of
 from jawusd.geometry import rigid_fit, se3_inverse, transform_points
 
-_LEAST_SHARE = 0.4  # fraction of the frames in which a point must be found to be used
-_FIXED_MM = 0.6  # largest typical distance of a point that follows the head from its mean place on it
-_LEAST_FIXED, _LEAST_MOVING = 8, 12  # numbers of points
-_LEAST_SPREAD_MM = 6.0  # smallest extent of the points that follow the head in their second direction
-_ROUNDS, _OUTLIER = 4, 2.5  # reweighting of points in a frame: rounds, and a robust sigma beyond which they count less
-_COMPONENTS = 12  # of the skin by which missing points are filled
+_LEAST_SHARE = 0.4  # minimum fraction of the frames in which a point is found
+_FIXED_MM = 0.6  # maximum typical distance of a point that follows the head from its mean position
+_LEAST_FIXED, _LEAST_MOVING = 8, 12  # minimum numbers of points that follow the head, and of other points
+_LEAST_SPREAD_MM = 6.0  # minimum extent of the points that follow the head along their second principal axis
+_ROUNDS, _OUTLIER = 4, 2.5  # rounds of reweighting points, and robust sigma beyond which they count less
+_COMPONENTS = 12  # number of components of skin motion used to fill in missing points
 
 
 def in_head(points: Array, T_world_head: Array, seen: Mask) -> Array:
-    """Return the points that move on the head, relative to it.
+    """Return the points that move relative to the head, in the skull frame.
 
     Args:
         points: points on the skin in the world [mm], NaN where they are not found, shape (F, N, 3).
-        T_world_head: poses of the head, right in the frames in which the teeth are visible, shape (F, 4, 4).
-        seen: those frames, shape (F,).
+        T_world_head: poses of the head, correct where the teeth are visible, shape (F, 4, 4).
+        seen: frames in which the teeth are visible, shape (F,).
 
     Returns:
         Points (F, M, 3) [mm] in the skull frame; NaN in frames in which too few points are found.
@@ -59,18 +59,18 @@ def _check(rest: Array, fixed: Mask) -> None:
             f"{moving} points on the skin of chin and lower face can be followed through the shot; at least "
             f"{_LEAST_MOVING} are needed.",
             hint="The skin needs texture that the cameras resolve: freckles, stubble, or painted dots of 1 to 2 mm. "
-            "Film sharp and closer, and without glare.",
+            "Film closer, in focus and without glare.",
         )
     if count < _LEAST_FIXED or spread < _LEAST_SPREAD_MM:
         raise FittingError(
             f"{count} points on the skin follow the head, over {spread:.0f} mm; at least {_LEAST_FIXED} over "
-            f"{_LEAST_SPREAD_MM:g} mm are needed to know the head where the teeth are hidden.",
+            f"{_LEAST_SPREAD_MM:g} mm are needed to determine the head pose where the teeth are hidden.",
             hint="Film nose and cheeks too, or paint dots on them.",
         )
 
 
 def _pose(rest: Array, found: Array) -> Array:
-    """Return the robust pose (4, 4) that moves points (N, 3) to those found (N, 3), NaN if too few are found."""
+    """Return the robust pose (4, 4) that moves points (N, 3) to the points found (N, 3), NaN if too few are found."""
     known = np.isfinite(found[:, 0])
     T = np.full((4, 4), np.nan)
     if known.sum() < _LEAST_FIXED / 2:
@@ -84,7 +84,7 @@ def _pose(rest: Array, found: Array) -> Array:
 
 
 def _completed(X: Array) -> Array:
-    """Fill points that are missing in some frames, by the components of skin motion; few points leave a frame NaN."""
+    """Fill in missing points using the components of skin motion; frames with too few points are NaN."""
     flat = X.reshape(len(X), -1)
     known = np.isfinite(flat)
     usable = known.mean(axis=1) >= 0.5
@@ -110,7 +110,7 @@ def columns_at(face_s: Array, weights: Array, times_s: Array) -> Array:
 
 
 def offsets_between(face_s: Array, times_s: Array) -> Array:
-    """Return the candidate clock offsets [s] at which a face capture and a jaw take overlap by at least half a take.
+    """Return the candidate clock offsets [s] at which face capture and jaw take overlap by half of the shorter one.
 
     Raises:
         FittingError: one of the takes is too short.

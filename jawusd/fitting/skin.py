@@ -146,7 +146,7 @@ def clock_offset(face_s: Array, X: Array, times_s: Array, d: Array) -> float:
         raise FittingError(
             f"the face data do not follow the jaw at any clock offset: they explain {explained[best]:.0%} of opening "
             f"and laterotrusion at best; at least {_LEAST_EXPLAINED:.0%} is required.",
-            hint="Use a face and a jaw of the same performance, or set their offset with --offset.",
+            hint="Use face and jaw data of the same performance, or set their offset with --offset.",
         )
     return refined_offset(float(tried[best]), face_s, f, times_s, d)
 

@@ -32,7 +32,8 @@ def destination(path: str | os.PathLike[str]) -> Path:
     """Return the file to which an output is written: the path or, for a link within its folder, the link's target.
 
     Raises:
-        OutputError: the path is a folder, a disk, a socket, a link that leads out of its folder, or an invalid name.
+        OutputError: the path is a folder, a block device, a socket, a link that leads out of its folder, or an invalid
+            name.
     """
     target = Path(path)
     try:

@@ -158,7 +158,7 @@ class CameraSource(Strict):
         Annotated[float, Field(ge=0.1, le=10)] | None,
         Key(
             "Pixel aspect ratio, width over height; default: from the file. Used with calibrations of desqueezed "
-            "pictures.",
+            "images.",
             "2.0",
         ),
     ] = None

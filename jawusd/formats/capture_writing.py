@@ -1,6 +1,6 @@
 """Write a new capture.toml, with comments that explain each part, or replace the picked points in one.
 
-A new file marks missing values. Replaced points leave everything else as it is, including comments.
+A new file marks missing values. When points are replaced, everything else is kept, including comments.
 """
 
 from __future__ import annotations

@@ -18,7 +18,7 @@ from jawusd.formats.mesh import COPY_AGAIN, MOST_TRIANGLES, MeshData, check_coun
 
 _HEADER = 84
 _TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
-_LENGTHS = (1e-6, 1e5)  # range of plausible coordinates, which reveals triangles beyond the declared count
+_LENGTHS = (1e-6, 1e5)  # range of plausible coordinates, to detect triangles beyond the declared count
 _SOLID = re.compile(rb"\n[ \t]*(end)?solid\b[^\n]*")
 _VERTEX = re.compile(rb"vertex\s+(\S+)\s+(\S+)\s+(\S+)")
 

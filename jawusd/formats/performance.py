@@ -32,9 +32,9 @@ class SolveState(IntEnum):
 
 #: Descriptions of the states.
 STATE_WORDS: dict[SolveState, str] = {
-    SolveState.SOLVED: "solved from the pictures",
+    SolveState.SOLVED: "solved from the images",
     SolveState.CARRIED: "hidden: interpolated from neighbouring frames",
-    SolveState.LOST: "lost: no pose fits the pictures",
+    SolveState.LOST: "lost: no pose fits the images",
     SolveState.SKIN: "hidden: estimated from facial skin",
 }
 #: RGB of an arch in overlays, by state; the colours also differ in brightness.

@@ -133,7 +133,7 @@ def sample_field(
         surfaces: The opposing surfaces.
         rig: The rig.
         step_mm: Grid step where surfaces are close; elsewhere, the step is twice as large.
-        most_opening_mm: Largest opening that is sampled; less if the surfaces separate earlier.
+        most_opening_mm: Largest sampled opening; smaller if the surfaces separate earlier.
     """
     box = _box(surfaces, rig, step_mm, most_opening_mm)
     field = _sampled(surfaces, rig, box, step_mm, _sampled(surfaces, rig, box, 2.0 * step_mm))

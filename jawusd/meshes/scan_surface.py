@@ -1,6 +1,6 @@
 """Clean surface of a teeth scan, and the border between crown and gum on it by random walks that rarely cross creases.
 
-A clean surface has merged points and no degenerate or duplicate faces; it knows its components and creases. Seeds of
+A clean surface has merged points and no degenerate or duplicate faces; its components and creases are known. Seeds of
 the walks are vertices that are certainly crown or gum. A vertex is labelled crown if a random walk that starts there is
 more likely to reach a crown seed first than a gum seed (Grady, "Random walks for image segmentation", PAMI 2006).
 """

@@ -71,7 +71,7 @@ def live(
         skin: facial skin, which determines d in frames with hidden teeth; see `LiveSkin`.
 
     Raises:
-        FormatError, RigError: the rig, or a file of the skin, cannot be read.
+        FormatError, RigError: the rig or a skin file cannot be read.
         FittingError: the skin contradicts the visible teeth.
         CaptureError, CalibrationError, SyncError: the shot or a source cannot be read.
         TrackingError: the scans are not in occlusion.
@@ -265,7 +265,7 @@ class _Follower:
         return jaw
 
     def _without_teeth(self, at: float, passed_s: float) -> LiveJaw | None:
-        """Return the jaw by skin alone, in a frame in which the teeth are searched for; None if it is unknown."""
+        """Return the jaw estimated from skin alone, in a frame in which the teeth are searched for; None if unknown."""
         if self._skin is None:
             return None
         unknown = LiveJaw(self._last_d, _UNKNOWN_MM**2 * np.eye(3), SolveState.CARRIED)

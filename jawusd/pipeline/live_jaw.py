@@ -87,22 +87,22 @@ class LiveFrame:
 #: Name of the standard input.
 STANDARD_INPUT = "-"
 _COMPARED = 240  # number of recent frames with visible teeth in which skin and teeth are compared
-_LATE_S = 0.1  # maximum time from an image to the arrival of the next row of the face [s]
-_APART_S = 0.2  # maximum time between two rows of the face between which it is interpolated [s]
+_LATE_S = 0.1  # maximum time from an image to the arrival of the next row of face data [s]
+_APART_S = 0.2  # maximum time between two rows of face data for interpolation between them [s]
 _KEPT = 1_000  # number of recent rows that are kept
 _POLL_S = 0.005  # time between attempts to read more of a growing file [s]
 
 
 class LiveSkin:
-    """The jaw of live frames by facial skin.
+    """The jaw in live frames, estimated from facial skin.
 
-    The face is a recording, in any format of `read_face`, if all cameras are files; its times begin with the images.
-    Otherwise it is a face table (see `formats.face_table`) that is followed while it is written: a growing file, a pipe
-    or the standard input. Its clock is aligned by the arrival of its rows.
+    The face data are a recording, in any format of `read_face`, if all cameras are files; its times begin with the
+    images. Otherwise, they are a face table (see `formats.face_table`) that is read while it is written: a growing
+    file, a pipe or the standard input. Its clock is aligned by the arrival times of the rows.
     """
 
     def __init__(self, rig: JawRig, options: SkinOptions, *, recorded: bool) -> None:
-        """Read the map, and the face if it is a recording; `recorded` is whether all cameras are files.
+        """Read the map, and the face data if they are a recording; `recorded` is whether all cameras are files.
 
         Raises:
             FormatError: a file is invalid, the map belongs to another subject, or a recording has other columns than
@@ -114,7 +114,7 @@ class LiveSkin:
         self._face: RecordedFace | FaceStream = (RecordedFace if whole else FaceStream)(self._skin, options)
 
     def play(self, begin_s: float, silence_s: float) -> None:
-        """Start the face: a recording at `begin_s` on the live clock; a stream when its first row has arrived.
+        """Start a recording at `begin_s` on the live clock, or wait for the first row of a stream.
 
         Raises:
             FormatError: a stream has no row within `silence_s` [s], or an invalid one.
@@ -122,11 +122,11 @@ class LiveSkin:
         self._face.play(begin_s, silence_s)
 
     def stop(self) -> None:
-        """Stop reading the face."""
+        """Stop reading the face data."""
         self._face.stop()
 
     def fuse(self, at_s: float, jaw: LiveJaw, seconds: float) -> LiveJaw:
-        """Return the jaw of a frame corrected by the skin; the state is `SKIN` if an arch is hidden and skin was used.
+        """Return the jaw of a frame, corrected with skin; the state is `SKIN` if an arch is hidden and skin was used.
 
         Args:
             at_s: time of the images on the live clock [s].
@@ -134,7 +134,7 @@ class LiveSkin:
             seconds: time since the previous frame [s].
 
         Raises:
-            FormatError: a row of the face is invalid, or has other columns than the map.
+            FormatError: a row of the face data is invalid, or has other columns than the map.
             FittingError: skin and visible teeth disagree.
         """
         columns = self._face.at(at_s)
@@ -209,7 +209,7 @@ class FaceStream:
             raise self._error
         if not self._rows:
             raise FormatError(
-                f"has no row of a face after {silence_s:g} s.",
+                f"has no row of face data after {silence_s:g} s.",
                 path=self._options.face,
                 hint="Check that the face tracker is running and writes a header and rows without buffering. "
                 "--silence sets the time limit.",
@@ -236,7 +236,7 @@ class FaceStream:
         return columns_between(times_s[max(k - 1, 0) : k + 1], np.stack([row for _, row in near]), time_s)
 
     def _offset_s(self) -> float:
-        """Return the seconds from the table's clock to the live clock, by the row that arrived with least delay."""
+        """Return the live clock minus the table's clock [s], from the row that arrived with the least delay."""
         return min(self._ahead_s) + (self._options.offset_s or 0.0)
 
     def _read(self) -> None:

@@ -78,7 +78,7 @@ def _footage(folder: Path) -> PageFootage:
     taken = take_footage(folder, _TILE_PX)
     if taken is None:
         raise CaptureError(
-            "the footage of the take is not there: this is not the folder of a build, or its capture was moved.",
+            "the footage of the take is not available: this is not the folder of a build, or its capture was moved.",
             path=folder,
             hint="Build the rig again, or leave out --footage.",
         )

@@ -28,7 +28,7 @@ from jawusd.pipeline.state import Progress
 from jawusd.segmentation.picture import ColourFootage
 
 # Minimum number of frames with visible teeth for comparison with the skin; standard deviation that is added to that of
-# the skin [mm], since d of the first pass is not exact either; and maximum mean squared difference of d over the
+# d from skin [mm], since d of the first pass is not exact either; and maximum mean squared difference of d over the
 # resulting variance. See docs/explanation/constants.md.
 _COMPARED, _FIRST_PASS_MM, _MOST_APART = 20, 0.5, 4.0
 
@@ -81,7 +81,7 @@ class SkinOfShot:
         found = self._skin(columns_at(self._face_s + self._known_offset(), self._columns, times))
         if not found.familiar.any():
             raise FittingError(
-                f"{os.fspath(self._face)}: the face of the {len(frames)} frames never resembles the face data from "
+                f"{os.fspath(self._face)}: in none of the {len(frames)} frames does the face resemble the data from "
                 "which the map was learned.",
                 hint="Check the units of face and map (--length-unit), the rigid body of the head (--rigid) and the "
                 "offset of the clocks (--offset).",
@@ -102,11 +102,11 @@ class SkinOfShot:
 
 
 def check_agreement(face: str | os.PathLike[str], found: SkinJaw, d: Array) -> None:
-    """Check that d of the skin agrees with d of visible teeth.
+    """Check that d from skin agrees with d from visible teeth.
 
     Args:
-        face: the file of the face, for messages.
-        found: jaw of the skin in frames with visible teeth and a familiar face.
+        face: the file of the face data, for messages.
+        found: d from skin in frames with visible teeth and a familiar face.
         d: jaw parameters measured from the teeth in these frames [mm], shape (F, 3).
 
     Raises:
@@ -120,13 +120,13 @@ def check_agreement(face: str | os.PathLike[str], found: SkinJaw, d: Array) -> N
             f"{os.fspath(face)}: in {len(d)} frames with visible teeth, d from the skin differs "
             f"from d from the teeth by {np.sqrt((away**2).mean()):.1f} mm (root mean square), "
             f"{np.sqrt(apart):.1f} times the expected error; at most {np.sqrt(_MOST_APART):g} times is accepted.",
-            hint="Check that the face is of this shot, the offset of the clocks (--offset), and that the map was "
-            "learned with this rig and the same points.",
+            hint="Check that the face data belong to this shot, and that the map was learned with this rig and the "
+            "same points; check the offset of the clocks (--offset).",
         )
 
 
 class SkinOfFootage:
-    """The jaw of the frames of a shot by its footage; a function object for the solver.
+    """Jaw parameters of a shot, estimated from points on the skin in its footage; a function object for the solver.
 
     Attributes:
         skin: the map from the points to d; None until it is learned.
@@ -139,7 +139,7 @@ class SkinOfFootage:
         footage: ColourFootage,
         progress: Callable[[int, int], None] = lambda done, total: None,
     ) -> None:
-        """Prepare; `cameras` are those of the footage, by name, and `progress` gets the frames done and their number.
+        """Store the cameras of the footage by name; `progress` is called with the number of frames done and the total.
 
         Raises:
             FittingError: there is only one camera.
@@ -153,17 +153,17 @@ class SkinOfFootage:
         self.skin: Skin | None = None
 
     def __call__(self, frames: Array, d: Array, seen: Mask, heads: Array) -> SkinJaw:
-        """Return the jaw of the skin in some frames; see `tracking.performance.skin.SkinOf`.
+        """Return the jaw parameters estimated from skin in some frames; see `tracking.performance.skin.SkinOf`.
 
         Raises:
             CaptureError: an image cannot be decoded.
             FittingError: too few points on the skin can be followed, or the jaw cannot be learned from them.
         """
         X = in_head(self.followed(frames.astype(int).tolist(), d, seen, heads), heads, seen)
-        # Without skin, these frames are interpolated, so that a chin rigid with the bone is no alternative.
+        # Without skin, these frames would be interpolated; a chin rigid with the bone is not an available alternative.
         self.skin = fit_skin(self._rig, X, d, seen, SIGMA_MM, head_error=(0.0, 0.0), chin_as_good=True)
         found = self.skin(X)
-        # Closed lips always differ from the parted ones of the training frames, but the covariance holds for them.
+        # Closed lips always differ from the parted lips of the training frames, but their covariance is valid.
         return found._replace(familiar=np.asarray(np.isfinite(found.d).all(axis=1)))
 
     def summary(self) -> dict[str, object]:
@@ -213,7 +213,7 @@ class SkinOfFootage:
 def skin_of_footage(
     capture: Capture, jaw: JawRig, offsets: Mapping[str, int], free_focal: bool, progress: Progress
 ) -> SkinOfFootage:
-    """Return the jaw by skin in the videos of a shot; `offsets` are the frame offsets by camera.
+    """Return the estimator that uses skin in the videos of a shot; `offsets` are the frame offsets by camera.
 
     Raises:
         CaptureError: no camera has a video, or one cannot be decoded.

@@ -29,8 +29,9 @@ if TYPE_CHECKING:
     from jawusd.meshes.solid import DistanceGrid
 
 
-_STEP_MM = 0.02  # of stored distances
-_DEEPER_MM, _FARTHEST_MM = 0.4, 0.6  # stored distances reach from this much below the closed bite to this
+_STEP_MM = 0.02  # quantisation step of stored distances
+# Range of stored distances: from this much deeper than the closed bite, to this distance.
+_DEEPER_MM, _FARTHEST_MM = 0.4, 0.6
 _TIPS_MM = 8.0  # height of the crowns, from the tips of the teeth, on which contacts are painted
 
 

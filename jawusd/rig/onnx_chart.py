@@ -88,7 +88,7 @@ class AnchoredChart:
         self._gauge, self.point = self._model.gauge.numbers, self._model.incisor
 
     def start(self, g: Graph, u: Value) -> Value:
-        """Return the displacements themselves."""
+        """Return u: the chart coordinates of this model are the displacements."""
         return u
 
     def motion(self, g: Graph, x: Value) -> ChartMotion:

@@ -101,7 +101,7 @@ def _rigs_in(layer: Sdf.Layer) -> list[Sdf.Path]:
 
 
 def _avoid_integers(layer: Sdf.Layer) -> None:
-    """Offset integer-valued transforms by `_OFFSET`, or in single precision to the next representable number."""
+    """Offset integer-valued transforms by `_OFFSET` or, in single precision, to the next representable number."""
     found: list[Sdf.Path] = []
     layer.Traverse(Sdf.Path.absoluteRootPath, lambda path: found.append(path) if _OP in path.name else None)
     for path in found:

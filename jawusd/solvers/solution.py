@@ -1,4 +1,4 @@
-"""What all modules of this package need: full precision, and iterative searches as differentiable functions.
+"""Shared by all modules of this package: full precision, and iterative searches as differentiable functions.
 
 Functions compute in float32 or float64, regardless of autocast and matrix multiplication settings: points are hundreds
 of millimetres from the origin, where bfloat16 resolves only 1 mm, and TensorFloat-32 0.1 mm.

@@ -19,7 +19,7 @@ _OTHER_MM = 1.0
 # Second difference of the motion of lower teeth above which earlier frames are followed again [mm]. Speech and chewing
 # reach 1 mm at 24 fps; a false positive costs the time of one frame.
 _JUMP_MM = 0.8
-_UNCONFIRMED_MM = 0.5  # minimum standard deviation of lower teeth beside a loss, where nothing confirms a pose
+_UNCONFIRMED_MM = 0.5  # minimum standard deviation of lower teeth in unconfirmed poses next to a loss
 
 
 class Located(Protocol):
@@ -62,7 +62,7 @@ class TwoWays(Generic[P]):
         fit_px: returns the length of the contour that fits a pose [px].
         margin: ratio of these lengths above which another pose replaces a trusted one.
         jump_mm: second difference of the motion of the lower teeth above which earlier frames are followed again [mm].
-        patience: number of successive lost frames in which no arch is gained after which following back ends.
+        patience: number of successive lost frames without a newly found arch after which tracking backwards ends.
         progress: called with the number of frames followed and the total.
         known: poses by frame.
     """
@@ -77,9 +77,9 @@ class TwoWays(Generic[P]):
     known: MutableMapping[int, P] = field(default_factory=dict)
 
     def follow(self, begin: Begin[P]) -> None:
-        """Follow the teeth from one frame to both ends, and back from frames by which earlier ones can be judged.
+        """Follow the teeth from one frame to both ends, and backwards from frames before which poses may be wrong.
 
-        Where a tracker recovers, its poses were wrong before, although each is plausible by itself.
+        Before a frame in which the tracker recovers, poses were wrong, although each is plausible on its own.
         """
         self.known[begin.frame] = begin.pose
         self.progress(1, len(self.frames))
@@ -97,9 +97,10 @@ class TwoWays(Generic[P]):
         follow: Callable[[range, P], Iterator[P]] | None = None,
         fit: Callable[[P], float] | None = None,
     ) -> None:
-        """Search where the teeth were lost for several frames; without any found poses, nothing is done.
+        """Search for the teeth where they were lost for several frames; do nothing if they were never found.
 
-        What is found is followed both ways, and discarded if it contradicts known poses and agrees with none.
+        Poses that are found are followed in both directions, and discarded if they contradict known poses and agree
+        with none.
 
         Args:
             search: searches in lost frames, given the nearest found pose. Raises TrackingError if it finds nothing.
@@ -138,9 +139,10 @@ class TwoWays(Generic[P]):
         doubted: Container[int] = (),
         fit: Callable[[P], float] | None = None,
     ) -> bool | None:
-        """Replace poses by others of the same frames, as long as the two differ and the latter are better.
+        """Replace poses with others of the same frames, up to the first trusted pose that agrees or fits better.
 
-        A pose that is trusted is replaced if the other fits better, an uncertain one keeps the better fit of both.
+        A trusted pose is replaced only if the other pose fits better; in other frames, the better of both poses is
+        kept.
 
         Args:
             way: frames in tracking order.
@@ -149,8 +151,8 @@ class TwoWays(Generic[P]):
             fit: measure of the better pose; `fit_px` by default.
 
         Returns:
-            True if a trusted pose was met that is equal, or differs little and fits better; False if a different one
-            fits better; None if an arch was lost and no other one gained, or the take ended.
+            True if a trusted pose is equal, or differs little and fits better; False if a trusted pose fits better and
+            contradicts the other; None if an arch was lost and no other arch found, or if the take ended.
         """
         misses, fit = 0, fit or self.fit_px
         for frame, other in zip(way, followed, strict=False):
@@ -169,12 +171,12 @@ class TwoWays(Generic[P]):
         return None
 
     def unconfirmed(self, follow: Callable[[range, P], Iterator[P]]) -> dict[int, float]:
-        """Return minimum standard deviations of the lower teeth [mm] in frames beside losses, by frame.
+        """Return minimum standard deviations of the lower teeth [mm] near lost frames, by frame.
 
         Just before a tracker loses the teeth, or after it has found them, a pose may be wrong although it fits. From
-        the frame beside each loss, the take is followed away from the loss, until a trusted pose is confirmed. Up to
-        there, poses are at least as uncertain as the distances between both, and the first one as its distance from the
-        motion of its neighbours.
+        the frame next to each loss, the take is therefore followed away from the loss until a trusted pose is
+        confirmed. Up to that frame, the standard deviation is at least the distance between the known and the new pose;
+        next to the loss, it is also at least the second difference of the motion.
 
         Args:
             follow: as in `Begin`.
@@ -190,7 +192,7 @@ class TwoWays(Generic[P]):
     def _doubts(
         self, beside: int, way: range, follow: Callable[[range, P], Iterator[P]]
     ) -> Iterator[tuple[int, float]]:
-        """Yield frames from one beside a loss to the first confirmed one, and how far their poses may be off [mm]."""
+        """Yield the frames from a loss to the first confirmed pose, and how far their poses may be off [mm]."""
         near = range(beside, beside + 3 * way.step, way.step)
         bent = all(frame in self.frames and self.known[frame].found.all() for frame in near)
         yield beside, self._bend_mm(near) if bent else 0.0
@@ -204,7 +206,7 @@ class TwoWays(Generic[P]):
     def _turning_points(self, way: range) -> Iterator[int]:
         """Yield the frames that are trusted more than their predecessor, or at which the jaw accelerates implausibly.
 
-        Poses may be replaced in the meantime.
+        The caller may replace poses between iterations.
         """
         for k in range(1, len(way)):
             jumps = k > 1 and self._bend_mm(way[k - 2 : k + 1]) > self.jump_mm

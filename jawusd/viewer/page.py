@@ -180,7 +180,7 @@ class Page:
         self.refresh()
 
     def play_take(self) -> None:
-        """Start to read the captured take, if there is one, and play it afterwards."""
+        """Start reading the captured take, if there is one, and play it afterwards."""
         self._opening = asyncio.get_running_loop().create_task(self.motion.play_take())
 
     def _add_contacts(self, actor: ViewedActor) -> ContactPanel | None:

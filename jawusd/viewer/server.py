@@ -37,7 +37,7 @@ class _WithoutTraceback(logging.Filter):
     """Log failed connections in one line without traceback, since any program may send invalid bytes."""
 
     def filter(self, record: logging.LogRecord) -> bool:
-        """Replace the traceback by the name of the error; keep every record."""
+        """Replace the traceback with the name of the error; keep every record."""
         if record.exc_info and record.exc_info[1] is not None:
             log.debug("a connection failed", exc_info=record.exc_info)
             record.msg, record.args = (
@@ -155,7 +155,7 @@ class Viewer(PageServer):
         play: bool = True,
         first: FirstPage | None = None,
     ) -> None:
-        """Start to serve an actor; see `PageServer`. Further errors are those of `load`, after which nothing is served.
+        """Start serving an actor; see `PageServer`. Further errors are those of `load`, after which nothing is served.
 
         Args:
             load: returns the actor; called once the server accepts visitors, who wait for it.
@@ -200,7 +200,7 @@ class Viewer(PageServer):
 
 def wait_until_drawn(client: viser.ClientHandle) -> None:
     """Wait until a page has drawn what it was sent, has been closed, or has not answered in time."""
-    with contextlib.suppress(TimeoutError, RuntimeError):  # a page that may store nothing answers with an error
+    with contextlib.suppress(TimeoutError, RuntimeError):  # a page without local storage answers with an error
         for _ in range(_ANSWERS):
             client.local_storage.get_item("drawn", _PATIENCE_S)
 

@@ -217,7 +217,7 @@ class Session:
         self.set_keys(with_key(self.work.keys, frame, self.work.d))
 
     def load_keys(self, loaded: Keys) -> None:
-        """Replace the keys, the frame rate and the interpolation by those of a file."""
+        """Replace the keys, the frame rate and the interpolation with those of a file."""
         work = replace(self.work, keys=loaded.keys, fps=loaded.fps, interpolation=loaded.interpolation)
         self._change(None, work)
 

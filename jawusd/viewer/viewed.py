@@ -59,7 +59,7 @@ class ViewedActor:
     # rig has no occlusion
     contacts: Callable[[Array], NDArray[np.uint8]] | None = None
     verdict: str = ""  # sentence on the build of the rig; "" if there is none
-    footage: ViewedFootage | None = None  # None if the capture is not there
+    footage: ViewedFootage | None = None  # None if the capture is not available
 
 
 @dataclass(frozen=True, eq=False)

@@ -182,7 +182,7 @@ def test_a_face_that_never_comes_or_goes_back_is_refused(learned, tmp_path):
     path = tmp_path / "live.csv"
     path.write_text(HEADER + "\n")
     silent = LiveSkin(rig, SkinOptions(skin, path), recorded=False)
-    with pytest.raises(FormatError, match="no row of a face after 0.2 s.*without buffering"):
+    with pytest.raises(FormatError, match="no row of face data after 0.2 s.*without buffering"):
         silent.play(0.0, 0.2)
     silent.stop()
     path.write_text("".join([HEADER + "\n", *lines([1.0, 0.5], np.zeros((2, 4, 3)))]))

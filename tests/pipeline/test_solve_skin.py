@@ -78,7 +78,7 @@ def test_skin_of_another_subject_or_other_points_is_refused(shot, tmp_path):
 def test_skin_that_contradicts_the_teeth_is_refused(shot):
     """A wrong unit, and clocks that are off by one and a half seconds."""
     rig, options, frames, true, seen = shot
-    with pytest.raises(FittingError, match="face of the 500 frames never resembles.*--length-unit"):
+    with pytest.raises(FittingError, match="none of the 500 frames does the face resemble.*--length-unit"):
         SkinOfShot(rig, replace(options, unit="cm", offset_s=LATE_S), FPS)(frames, true, seen)
     with pytest.raises(FittingError, match="frames with visible teeth, d from the skin differs.*--offset"):
         SkinOfShot(rig, replace(options, offset_s=LATE_S + 1.5), FPS)(frames, true, seen)

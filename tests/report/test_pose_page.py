@@ -328,7 +328,7 @@ def filmed(tmp_path_factory):
     """Write the page of a rig whose folder records the example capture, with footage."""
     folder = shutil.copytree(EXAMPLE_RIG.parent, tmp_path_factory.mktemp("filmed") / "rig")
     page = folder / "jaw.html"
-    with pytest.raises(CaptureError, match="is not there"):
+    with pytest.raises(CaptureError, match="is not available"):
         write_page(folder, page, footage=True)
     record_build(folder, EXAMPLE)
     write_page(folder, page, footage=True)

@@ -254,7 +254,7 @@ def test_a_solve_is_shown_with_its_states(viewed, copy, tmp_path):
     footage = opened.page.footage
     assert footage.worst[:2] == [FIRST + 20, FIRST + 7]  # invalid poses first, then unobserved ones
     words = footage._words.content
-    assert "upper: solved from the pictures" in words and "d1 opening 10.00 &plusmn; 0.05 mm" in words
+    assert "upper: solved from the images" in words and "d1 opening 10.00 &plusmn; 0.05 mm" in words
     opened.press(footage.slider, FIRST + 20)
     assert "bound: outside, margin -0.75 mm: <b>invalid for the rig" in footage._words.content
     opened.press(footage.slider, FIRST + 7)

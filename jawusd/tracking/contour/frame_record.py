@@ -212,7 +212,7 @@ _Places = list[tuple["slice[int, int, int]", tuple[int, ...]]]
 
 @lru_cache(maxsize=8)
 def _places(views: int) -> tuple[_Places, _Places]:
-    """Return slices and shapes of the arrays in a packed record: those of quality figures, and those of sums."""
+    """Return slices and shapes of the arrays in a packed record: quality figures, then sums over samples."""
     half = (len(_LOWER[0]),)
     figures = ((2, 4, 4), (2, 3), (2, views), (2,), (2, views), (2, views), (2, 3), (1,))
     sums = [(2, views, *shape) for shape in (half, *_SUM_SHAPES[1:])]

@@ -17,7 +17,7 @@ _SHARE = 0.002  # fraction of the crown surface that is ignored as outliers, suc
 _DEEPEST_MM = 5.0  # maximum depth of a point inside a crown [mm]: deeper points lie beyond an open border
 _DEEP_MM = 1.0
 _SAME_MM = 0.05
-_BESIDE_MM = 4.0  # maximum distance in the bite plane between opposed crown points [mm]: half the width of a molar
+_BESIDE_MM = 4.0  # maximum distance in the occlusal plane between opposed crown points [mm]: half the width of a molar
 _CELL_MM = 1.0
 _THROUGH_MM = 2.0  # minimum vertical overlap of arches that passed through one another [mm]; cusps overlap less
 _SLAB_MM = 3.0
@@ -39,14 +39,14 @@ class Occlusion:
     side_gaps_mm: tuple[float, float]  # gaps left and right of the midline [mm], negative if crowns overlap
     depth_mm: float  # maximum depth by which the crowns overlap [mm]
     deep_share: float  # fraction of the opposed crown surface that is more than 1 mm inside the other arch
-    # fraction of the common area in the bite plane in which lower crowns reach more than 2 mm above the lowest point of
-    # the upper ones
+    # fraction of the common area in the occlusal plane in which lower crowns reach more than 2 mm above the lowest
+    # point of the upper ones
     through: float
     same: float  # fraction of the lower surface that coincides with the upper one
     # fraction of crown points directly above or below crowns of the other arch; the larger value of both arches
     opposite: float
-    aside_mm: float  # distance between the centres of the arches along the bite plane [mm]
-    # angle in the bite plane between the forward directions of both arches [rad]
+    aside_mm: float  # distance between the centres of the arches along the occlusal plane [mm]
+    # angle in the occlusal plane between the forward directions of both arches [rad]
     turn_rad: float
     # per arch, whether its gum lies between its crowns and the other arch; None if unknown
     turned_over: tuple[bool | None, bool | None]
@@ -128,7 +128,7 @@ def _signed_distances(these: CrownSurface, others: CrownSurface) -> Array:
 
 
 def _through(upper: Array, lower: Array) -> float:
-    """Return the fraction of the common area in the bite plane where the lower crowns reach far above the upper ones.
+    """Return the fraction of the common area in the occlusal plane where lower crowns reach far above the upper ones.
 
     Args:
         upper, lower: crown points (left, up, front) [mm], shapes (N, 3) and (M, 3).

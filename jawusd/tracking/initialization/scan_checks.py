@@ -16,8 +16,8 @@ from jawusd.tracking.initialization.occlusion import Occlusion, measure_occlusio
 
 # The limits lie outside the range of all valid bites measured (docs/explanation/constants.md). Limits beyond which a
 # bite is impossible: distance between the arches, fraction of the bite in which the arches interpenetrate, fraction of
-# coinciding surface, minimum fraction of opposed crown surface, rotation about the bite normal, maximum and minimum
-# width of an arch.
+# coinciding surface, minimum fraction of opposed crown surface, rotation about the normal of the occlusal plane,
+# maximum and minimum width of an arch.
 _APART_MM = 4.0
 _THROUGH_SHARE = 0.5
 _SAME_SHARE = 0.5
@@ -76,8 +76,8 @@ def occlusion_findings(scans: Sequence[Scan], T_anatomical_scan: ArrayLike | Non
             Finding(
                 "anatomical_axes_off",
                 "warning",
-                f"the up axis of [anatomy] T_anatomical_skull is {tilt_deg:.0f} degrees off the normal of the bite; "
-                f"up to {_AXES_OFF_DEG:g} degrees is usual",
+                f"the up axis of [anatomy] T_anatomical_skull is {tilt_deg:.0f} degrees off the normal of the "
+                f"occlusal plane; up to {_AXES_OFF_DEG:g} degrees is usual",
                 tilt_deg,
                 _AXES_OFF_DEG,
                 hint="Correct or remove T_anatomical_skull: without it the axes are derived from the scans.",
@@ -102,7 +102,7 @@ def _impossible(found: Occlusion) -> Iterator[Finding]:
         yield error("scans_same", message, found.same, _SAME_SHARE, "Specify the other arch's file in [scans].")
     if found.opposite < _BESIDE_SHARE and found.turn_rad < _FACING_BACK_RAD:
         message = f"{off}the arches are {found.aside_mm:.0f} mm apart sideways; only {found.opposite:.0%} of the "
-        message += f"smaller one overlaps the other in the bite plane; at least {_BESIDE_SHARE:.0%} is needed"
+        message += f"smaller one overlaps the other in the occlusal plane; at least {_BESIDE_SHARE:.0%} is needed"
         yield error("scans_beside", message, found.opposite, _BESIDE_SHARE)
     if found.gap_mm > _APART_MM:
         message = f"{off}they are {found.gap_mm:.1f} mm apart at the closest point; at most {_APART_MM:g} mm is "

@@ -72,7 +72,7 @@ def possible_exchanges(sources: Sequence[CameraSource]) -> list[MaskExchange]:
 
 
 def likely_exchange(footage: Footage, solver: ContourSolver, poses: Array, frame: int) -> MaskExchange | None:
-    """Return the swap that best explains why masks lie off their scans, with its evidence; None if no swap does.
+    """Return the swap that best explains why masks lie outside their scans, with its evidence; None if no swap does.
 
     `poses` are T_world_upper and T_world_lower of the frame, accurate to about 1 mm, shape (2, 4, 4).
     """
@@ -96,7 +96,7 @@ def likely_exchange(footage: Footage, solver: ContourSolver, poses: Array, frame
     share, before, exchange = min(found, key=lambda f: f[0] / f[1])
     if share >= _PROOF * before:
         return None
-    evidence = f"{before:.0%} of the masks lie off their scans, {share:.0%} after exchanging them"
+    evidence = f"{before:.0%} of the mask area lies outside the scans, {share:.0%} after exchanging them"
     return replace(exchange, finding=f"{exchange.finding}: {evidence}")
 
 

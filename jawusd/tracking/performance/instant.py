@@ -17,10 +17,10 @@ from jawusd.tracking.contour.views import View
 from jawusd.tracking.performance.coordinates import HEAD, JAW, LOCAL, OPENING, Coordinates, Pose
 from jawusd.tracking.performance.misfit import Misfit
 
-# Standard deviation of the rig's soft bound, and distance beyond it from which its pull is constant [mm]. The bound is
-# the range of motion in the take that the rig was fitted to; with a hard bound, jaws beyond this range would be lost.
-# In other takes of 14 synthetic persons, a third of the frames lies beyond, by distances of 1.6 mm on average that are
-# distributed exponentially; the pull is that of such a distribution.
+# Standard deviation of the rig's soft bound, and distance beyond it from which the penalty grows linearly [mm]. The
+# bound is the range of motion in the take that the rig was fitted to; with a hard bound, jaws beyond this range would
+# be lost. In other takes of 14 synthetic persons, a third of the frames lies beyond, by distances of 1.6 mm on average
+# that are distributed exponentially; the penalty is that of such a distribution.
 _BOUND_MM, _BOUND_LINEAR_MM = 1.0, 0.6
 # Standard deviation of openings below the smallest captured one [mm]: closed teeth cannot close further.
 CLOSED_MM = 0.1

@@ -75,7 +75,7 @@ class Prediction:
         self.last, self._carried_mm2 = pose, None
 
     def carry(self, d: Array, variance_mm2: Array) -> None:
-        """Replace the jaw of the last frame by d [mm] from elsewhere, shape (3,), with variances [mm^2], shape (3,)."""
+        """Replace the jaw of the last frame with d [mm], shape (3,), and its variances [mm^2], from another source."""
         self.last, self._carried_mm2 = replace(self.last, d=d), variance_mm2
 
 

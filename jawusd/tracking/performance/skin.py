@@ -1,4 +1,4 @@
-"""The factor of facial skin on d, with a slowly varying error that frames with visible teeth reveal.
+"""Measurements of d from facial skin, with a slowly varying error that frames with visible teeth reveal.
 
 Skin measures d in each frame as d_skin = d + L u + w, where L L^T is a fraction of the covariance that the learned map
 predicts. The slow error u is an Ornstein-Uhlenbeck process with unit variance (Rasmussen and Williams 2006, equation
@@ -31,7 +31,7 @@ _SHARE, _SLOW_S, _FAST_S = 0.7, 1.0, 0.04
 
 
 class SkinFactor:
-    """Normal equations of the skin's measurements of d.
+    """Normal equations of the measurements of d from skin.
 
     Attributes:
         used: frames with a factor, shape (F,): those in which the face is known.
@@ -90,7 +90,7 @@ class SkinFactor:
         system.add_steps(slice(last, system.local), steps, np.full(3, weight))
 
     def _prior(self) -> Array:
-        """Return the precision of each frame's slow error that remains beside the precision of its steps, shape (F,).
+        """Return the precision of each frame's slow error, in addition to that of its steps, shape (F,).
 
         For unit variance and correlation c between neighbours, (x' - c x)^2 / (1 - c^2) is split into
         c (x' - x)^2 / (1 - c^2) and terms in x^2 and x'^2.
@@ -113,18 +113,18 @@ class SkinFilter:
     def fuse(
         self, skin: SkinJaw, d: Array, covariance: Array, *, seen: bool, seconds: float
     ) -> tuple[Array, Array, bool]:
-        """Combine d of a frame with that of its skin.
+        """Combine d of a frame with d estimated from skin.
 
         Args:
-            skin: jaw of the skin in the frame; d of shape (3,).
-            d: jaw parameters without the skin [mm], shape (3,): measured or predicted.
+            skin: d estimated from skin in the frame, shape (3,).
+            d: jaw parameters without skin [mm], shape (3,): measured or predicted.
             covariance: their covariance [mm^2], shape (3, 3).
             seen: whether d was measured from both arches. Only then is the slow error corrected, since a predicted d
                 repeats the errors of earlier frames.
             seconds: time since the previous frame [s].
 
         Returns:
-            d and its covariance, and whether the skin was used, which it is if the face is known.
+            d and its covariance, and whether skin was used: only if the face is known.
         """
         keep = _kept(seconds)
         self._slow = keep * self._slow
@@ -143,10 +143,11 @@ class SkinFilter:
 
 
 def _slow_and_fast(covariance: Array, seconds: float) -> tuple[Array, Array]:
-    """Split covariances of the skin (..., 3, 3) in frames `seconds` apart.
+    """Split covariances of d from skin (..., 3, 3) into slow and fast errors, for frames `seconds` apart.
 
     Returns:
-        The change of d [mm] with the slow error, and the covariance of the fast error [mm^2], shape (..., 3, 3) each.
+        The derivative of d [mm] with respect to the slow error, and the covariance of the fast error [mm^2], shape
+        (..., 3, 3) each.
     """
     slope = np.sqrt(_SHARE) * np.linalg.cholesky(covariance)
     return slope, (1 - _SHARE) * max(1.0, _FAST_S / seconds) * covariance

@@ -55,7 +55,7 @@ class Unknowns:
         free_focal: bool = False,
         annotator: AnnotatorPrior = DRAWN,
     ) -> None:
-        """Lay out the unknowns of a take with a number of frames and cameras."""
+        """Lay out the unknowns of a take with the given numbers of frames and cameras."""
         self._coordinates, self.fixed_head, self._cameras = coordinates, fixed_head, cameras
         self.free_focal = cameras if free_focal else 0
         sigma = annotator.sigma(cameras)

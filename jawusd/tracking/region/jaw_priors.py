@@ -160,7 +160,7 @@ class BiteTerm:
 
     Attributes:
         points: points on the lower teeth, in scan coordinates [mm], shape (N, 3).
-        up: bite normal in scan coordinates, shape (3,).
+        up: normal of the occlusal plane in scan coordinates, shape (3,).
         noise_px3: variance of border errors times their correlation length.
     """
 

@@ -130,7 +130,7 @@ class RigTracker:
         return replace(fit, uncertain=bool((share < THOROUGH.uncertain * usual).any()))
 
     def carry(self, d: Array, variance_mm2: Array) -> None:
-        """Predict the next frame from d of elsewhere; see `Prediction.carry`."""
+        """Predict the next frame from d of another source; see `Prediction.carry`."""
         self._motion.carry(d, variance_mm2)
 
     def _remember(self, share: Array) -> None:

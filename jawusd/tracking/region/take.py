@@ -117,7 +117,7 @@ def footage_findings(tracks: Tracks) -> list[Finding]:
     share = float(bad.mean())
     if share <= _FEW:
         return []
-    judgement = "is not usable as it is" if share > _MANY else "is partly unreliable"
+    judgement = "is not usable" if share > _MANY else "is partly unreliable"
     message = (
         f"the footage {judgement}: in {bad.sum()} of {len(bad)} frames the jaw is lost or its uncertainty exceeds "
         f"{_UNKNOWN_MM:g} mm; usually at most {_FEW:.0%} of the frames are affected"

@@ -22,7 +22,7 @@ class LostSearch:
     """Searches for both arches in the masks of frames in which a tracker lost them, without using its predictions."""
 
     def __init__(self, make_search: Callable[[], StartSearch], footage: Footage) -> None:
-        """Store a function that prepares a search, which takes time and is seldom needed, and the masks."""
+        """Store a function that prepares a search, which takes time and is rarely needed, and the masks."""
         self._make_search, self._footage = make_search, footage
 
     def frames(self, lost: range, records: Mapping[int, FrameRecord]) -> list[int]:

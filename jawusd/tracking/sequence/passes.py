@@ -1,4 +1,4 @@
-"""Tracking of the frames of a take from the first one, and judgement of its frames by one another."""
+"""Tracking of the frames of a take from the first one, and comparison of its frames with one another."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ Progress = Callable[[int, int], None]
 # Maximum number of frames around a restart from which the tracker is initialised: without this limit, long takes with
 # many gaps would take quadratic time.
 _NEARBY_FRAMES = 4000
-# Number of lost frames through which teeth are followed back: wrong masks often last for a few frames, and with masks
-# lost frames are tried fast.
+# Number of lost frames after which tracking backwards ends: wrong masks often last for a few frames, and with masks,
+# trying a lost frame takes little time.
 _PATIENCE = 16
 
 
@@ -54,9 +54,9 @@ class Passes:
         self.searches = SearchBudget(stop - first)
 
     def track_from(self, frame: int, poses: Array, search: LostSearch) -> None:
-        """Track from the given frame in both directions, and back from frames by which others can be judged.
+        """Track from the given frame in both directions, and backwards from frames before which poses may be wrong.
 
-        Where the teeth stay lost although there are masks, they are searched for.
+        In lost frames with masks, the teeth are then searched for.
 
         Args:
             frame: reference frame number.
@@ -116,7 +116,7 @@ class Passes:
         return first_record(self._solver, self._config, poses, self._masks.at(frame), frame, True)
 
     def judge_first(self, take: TwoWays[FrameRecord], first: int) -> None:
-        """Follow from the nearest frame with a good fit back to the first one, and on until an equal pose is met.
+        """Track from the nearest frame with a good fit back to the first frame, and beyond it until the poses agree.
 
         The first frame was aligned before the usual fit was known, and its neighbours were followed from it.
         """
