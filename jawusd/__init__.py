@@ -1,7 +1,7 @@
 """jawusd: capture in, jaw rig out.
 
-Importing this package loads nothing heavy; what its names need is loaded when they are first used. It tells OpenUSD
-where the schema `JawRigAPI` is (`jawusd info --schema`).
+Importing this package loads no heavy modules; they are loaded when names that need them are first used. The import
+tells OpenUSD where to find the schema `JawRigAPI` (`jawusd info --schema`).
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ def load(path: str | PathLike[str], *, prim: str | None = None, fast: bool = Fal
     Raises:
         FormatError: the file is not a rig, is incomplete, or was written by a newer version.
         RigError: the stage cannot be opened.
-        ResourceError: it needs more memory than there is.
+        ResourceError: there is not enough memory.
         MissingDependencyError: ``fast`` without numba, a `.onnx` without onnxruntime.
         ValueError: ``fast`` or ``untrusted`` with a `.onnx`.
     """

@@ -113,7 +113,7 @@ def check_units(meta: Mapping[str, object], path: str | os.PathLike[str]) -> Non
     """Check the units and the twist order in a file's metadata.
 
     Raises:
-        UnitsError: they differ from mm, rad and (omega, v), or are missing.
+        UnitsError: the units or the twist order are missing, or differ from mm, rad and (omega, v).
     """
     if meta.get("units") != UNITS:
         raise UnitsError(f"units are {meta.get('units')}; they must be {UNITS}.", path=path)

@@ -71,7 +71,7 @@ def different_board(images: Sequence[NDArray[np.uint8]], boards: Boards, missed:
 
 
 def _common_chessboard(images: Sequence[NDArray[np.uint8]]) -> tuple[tuple[int, int], int]:
-    """Return the numbers of inner corners, columns first, of the chessboard that most images show, and their number."""
+    """Return the numbers of inner corners (columns, rows) of the most frequent chessboard, and its number of images."""
     flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_LARGER
     found = [cv2.findChessboardCornersSBWithMeta(image, (3, 3), flags=flags) for image in images]
     sizes = Counter((max(meta.shape), min(meta.shape)) for ok, _, meta in found if ok)

@@ -308,7 +308,7 @@ def _judged(rig: JawRig, face: Path, options: FaceOptions) -> JudgedFace:
 def counted(
     frames: Array | NDArray[np.int64], verdicts: Verdicts
 ) -> tuple[list[dict[str, object]], dict[str, int | float], str]:
-    """Return the verdicts on frames (F,) as rows for JSON, and their numbers for JSON and in words."""
+    """Return the verdicts on frames (F,) as rows for JSON, and their counts for JSON and in words."""
     rows = _verdict_rows(frames, verdicts)
     inside, valid = int((verdicts.valid & verdicts.inside()).sum()), int(verdicts.valid.sum())
     counts = {"inside": inside, "within_tolerance": valid - inside, "invalid": len(rows) - valid}

@@ -91,7 +91,7 @@ class SliceHull:
         return distance, gradient
 
     def signed_distance_curvature(self, d: Array) -> tuple[Array, Array, Array]:
-        """Return signed distance (n,), gradient (n, 3) and part of the Hessian, that of the rounding, (n, 3, 3) [1/mm].
+        """Return signed distance (n,), gradient (n, 3), and the part of the Hessian due to rounding, (n, 3, 3) [1/mm].
 
         The rest of the Hessian, from the curvature of the supports along d1, is omitted: the result is positive
         semidefinite, so that solver steps point downhill.
@@ -231,7 +231,7 @@ class Ranges(NamedTuple):
 
 
 def normalized(bound: SliceHull, d_range: Array, d: Array) -> Array:
-    """Return d (n, 3) [mm] as fractions: d1 of the full opening, d2 and d3 of the ranges on their sides at d1."""
+    """Return d (n, 3) [mm] as fractions of the full opening (d1) and of the ranges on their sides at d1 (d2, d3)."""
     return d / _scale(bound, d_range, d[:, 0], d)
 
 

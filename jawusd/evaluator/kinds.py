@@ -148,7 +148,7 @@ class JawFormula(Protocol):
 class AnchoredNumbers(NamedTuple):
     """The scalars of an anchored model (see `AnchoredModel`); `linear` has 3 inputs times 3 outputs [rad].
 
-    `spread` is as from `spread_of`.
+    `spread` is the result of `spread_of`.
     """
 
     gauge: GaugeNumbers

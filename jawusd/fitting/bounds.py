@@ -45,7 +45,7 @@ _FOLDS, _BLOCK = 5, 50  # number of folds, and length of their blocks [frames], 
 # empty.
 _MARGIN_MM = 0.38
 _CONTACT_TOLERANCE_MM = 0.05  # extension of the hull below the captured openings [mm]
-_FRAMES_PER_SLIP = 400  # one in this many frames may, by noise, lie beyond closed teeth
+_FRAMES_PER_SLIP = 400  # because of noise, one in this many frames may lie beyond closed teeth
 _SHORTEST_RANGE_MM = 1.0
 _TOLERANCE_QUANTILE, _LARGEST_TOLERANCE_MM = 0.95, 1.0
 

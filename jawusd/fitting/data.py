@@ -264,7 +264,7 @@ class FittedForm:
 
     model: JawModelForm
     kept: Mask  # mask of the training frames that were not trimmed as outliers, shape (N,)
-    notes: dict[str, object]  # JSON-serialisable facts about the fit, for the header of the model file
+    notes: dict[str, object]  # JSON-serialisable results of the fit, for the header of the model file
 
 
 def screened(selection: Selection) -> Selection:

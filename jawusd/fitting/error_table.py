@@ -86,7 +86,7 @@ def _distance(model: JawModelForm, seen: TrainingData, unseen: TrainingData) -> 
 
 
 def _growth(distance: Array, errors: Array, seen: Array) -> dict[str, float]:
-    """Return the rms error of training frames, and its growth with distance such that most held-out errors are below.
+    """Return the rms error of training frames, and the growth with distance that bounds most held-out errors.
 
     With few frames the growth is uncertain, so it is averaged on a logarithmic scale with a multiple of the rms error.
     """

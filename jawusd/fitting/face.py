@@ -1,6 +1,6 @@
 """Faces in a performance: clocks of face captures and jaw takes, skin points in the frame of the head, and jaw errors.
 
-The frame of the head is that of the points that follow the head, which show where no teeth are visible.
+The pose of the head is estimated from points that follow the head, which are visible even if the teeth are not.
 """
 
 from __future__ import annotations
@@ -113,7 +113,7 @@ def offsets_between(face_s: Array, times_s: Array) -> Array:
     """Return the candidate clock offsets [s] at which face capture and jaw take overlap by half of the shorter one.
 
     Raises:
-        FittingError: one of the takes is too short.
+        FittingError: a take is too short.
     """
     shorter = min(face_s[-1] - face_s[0], times_s[-1] - times_s[0]) if len(times_s) > 1 else 0.0
     if shorter < _LEAST_SECONDS:

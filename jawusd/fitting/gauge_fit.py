@@ -93,7 +93,7 @@ def fit_gauge(u: Array, weights: Array, path: Gauge, shown: Mask) -> GaugeFit:
         shown: which of opening, laterotrusion and protrusion the data excite, shape (3,).
 
     Returns:
-        The gauge; if no stiffness makes it invertible, the gauge of the path alone, which always is.
+        The gauge; if no stiffness makes it invertible, the gauge of the path alone, which is always invertible.
     """
     for stiffness in _STIFFNESSES:
         gauge = _fit(u, weights, path, shown, stiffness)

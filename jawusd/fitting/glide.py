@@ -99,7 +99,7 @@ def _axis(values: Array) -> Array:
 
 
 def _contact_drop(form: AnchoredModel, teeth: Teeth, d2: Array, d3: Array, captured: Array) -> Array:
-    """Return how far below closed bite the incisal point is when the teeth just touch [mm], on a grid (n2, n3)."""
+    """Return how far below the closed bite the incisal point is when the teeth just touch [mm], on a grid (n2, n3)."""
     side, front = (x.ravel() for x in np.meshgrid(d2, d3, indexing="ij"))
     wanted = _near(np.stack([side, front], axis=1), captured[:, 1:])
     ahead = front + form.gauge.arch(np.zeros_like(side), side)[0]

@@ -206,8 +206,8 @@ def _check_errors(errors: dict[str, float]) -> None:
                 f"the jaw learned from the face has an error of {errors['skin']:.2f} mm at the incisal point on "
                 f"held-out frames; the error of {words} is {errors[name]:.2f} mm. At most {_MOST_SHARE:.0%} of that "
                 f"is accepted.",
-                hint="Check that face and jaw show the same performance on one clock, and that the head is stabilised. "
-                "Add points or expressions; if a rigid chin is as good, use inverse kinematics (`rig.ik`).",
+                hint="Check that face and jaw data show the same performance on one clock, and that the head is "
+                "stabilised. Add points or expressions; if a rigid chin is as good, use inverse kinematics (`rig.ik`).",
             )
 
 

@@ -82,7 +82,7 @@ class LiveSource:
         """Check that a device or stream has sent an image within `silence_s` [s].
 
         Raises:
-            CaptureError: it has not sent an image.
+            CaptureError: the source has not sent an image.
         """
         if self._streams and not self.ended and now_s() - self._heard_s > silence_s:
             raise CaptureError(

@@ -53,7 +53,7 @@ class PngMasks:
         """
         self._pattern, self._size_px, self._labels, self._is_other = pattern, size_px, labels, is_other
         self.odd: dict[int, str] = {}
-        # File names take less memory than paths; hours of several cameras give a hundred thousand files.
+        # File names take less memory than paths; hours of footage from several cameras give a hundred thousand files.
         self._names = self._found(pattern) if "%" in pattern.name else _names(numbered_files(pattern))
         self.count = max(self._names) + 1
 
@@ -144,7 +144,7 @@ class PngMasks:
 
 
 class VideoMasks:
-    """Masks stored as a video: its black and white images, or its alpha channel.
+    """Masks stored as a video: its black-and-white images, or its alpha channel.
 
     Attributes:
         count: number of images.
@@ -197,7 +197,7 @@ class OneMask:
     Attributes:
         frame: frame number of the camera.
         image: 255 for tooth, 0 for background, shape (h, w).
-        odd: reasons why images were rejected; none.
+        odd: reasons why images were rejected; always empty.
     """
 
     frame: int

@@ -292,7 +292,7 @@ class CreaseWalk:
         leaving = (part[inside] >= 0) & (part[outside] < 0)
         i, j = inside[leaving], outside[leaving]
         flow = np.bincount(part[i], steps.data[leaving] * (1.0 - share[j]), count)
-        # Each edge that crosses the outline counts as outline of its own length.
+        # Each edge that crosses the outline adds its length to that of the outline.
         length = np.linalg.norm(self._surface.vertices[i] - self._surface.vertices[j], axis=1)
         outline = np.maximum(np.bincount(part[i], length, count), 1e-9)
         number = np.maximum(np.bincount(part[i], minlength=count), 1)

@@ -230,7 +230,7 @@ def open_colour_footage(
 
     Args:
         offsets: frame offset by camera.
-        work: what the footage is for, in words, if that needs two cameras.
+        work: name of the task, for messages, if the task needs at least two cameras.
 
     Raises:
         CaptureError, CalibrationError: see `open_footage`; or fewer than two cameras have a video.

@@ -1,4 +1,4 @@
-"""The jaw of live frames, corrected by facial skin: the rows of a face tracker are matched with the images by time."""
+"""The jaw in live frames, corrected with facial skin: rows of a face tracker are matched with the images by time."""
 
 from __future__ import annotations
 
@@ -156,7 +156,7 @@ class RecordedFace:
         """Read the recording.
 
         Raises:
-            FormatError: it is invalid, or has other columns than those of the map or no frame rate.
+            FormatError: the recording is invalid, has other columns than the map, or has no frame rate.
         """
         times_s, self._rows = read_shot_face(skin, options)
         self._times_s, self._begin_s = times_s + (options.offset_s or 0.0), 0.0
@@ -200,7 +200,7 @@ class FaceStream:
         """Read in a thread, and wait for the first row.
 
         Raises:
-            FormatError: there is none within `silence_s` [s], or it is invalid.
+            FormatError: no row arrives within `silence_s` [s], or the row is invalid.
         """
         threading.Thread(target=self._read, daemon=True).start()
         with self._changed:

@@ -81,7 +81,7 @@ class _Candidate:
 
 @dataclass(frozen=True, eq=False)
 class PictureSearch(Generic[T]):
-    """A search for the teeth in footage, without masks, or at picks.
+    """A search for the teeth in footage without masks, everywhere or at picks.
 
     Attributes:
         footage: the images of the cameras that have a video.

@@ -70,7 +70,7 @@ class BuildFacts:
         """Return the capture.
 
         Raises:
-            FormatError: it is not available.
+            FormatError: the capture is not available.
         """
         if self.capture is None:
             raise FormatError(self.why_not)

@@ -36,7 +36,7 @@ class SkinOptions:
     Attributes:
         skin: the map from skin to d, written by `jawusd skin-fit`.
         face: facial motion during the shot; it has the columns from which the map was learned.
-        fps: frame rate of the face [1/s], if the file does not state it.
+        fps: frame rate of the face data [1/s], if the file does not state it.
         offset_s: seconds from frame 0 of the shot to frame 0 of the face data; None: estimated.
         unit, rigid, rest_frame: see `read_face`.
         only: whether to ignore the images of the shot.

@@ -110,7 +110,7 @@ def check_agreement(face: str | os.PathLike[str], found: SkinJaw, d: Array) -> N
         d: jaw parameters measured from the teeth in these frames [mm], shape (F, 3).
 
     Raises:
-        FittingError: they differ by much more than their expected error.
+        FittingError: the two differ by much more than their expected error.
     """
     away = found.d - d
     variance = np.einsum("fii->fi", found.covariance) + _FIRST_PASS_MM**2

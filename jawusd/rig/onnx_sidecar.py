@@ -254,7 +254,7 @@ def check_made_from(model: onnx.ModelProto, rig: JawRig, path: str | os.PathLike
     """Check that a graph was made from the model of a rig.
 
     Raises:
-        FormatError: It was made from another model.
+        FormatError: The graph was made from another model.
     """
     if _properties(model).get("rig_hash") != rig.model_hash:
         raise FormatError("was made from another model (rig_hash differs); bake the rig again.", path=path)

@@ -174,7 +174,7 @@ def _check_own(path: Path) -> None:
     """Check that a file to be copied is a regular file, and not a link to another folder.
 
     Raises:
-        RigError: It is not a regular file, or links to another folder.
+        RigError: The file is not a regular file, or links to another folder.
     """
     check_input(path, RigError)
     if not is_allowed(path) and not path.resolve().is_relative_to(path.parent.resolve()):

@@ -142,7 +142,7 @@ def check_units(prim: Usd.Prim, where: object) -> None:
     """Check units and twist order.
 
     Raises:
-        UnitsError: They differ from mm, rad and (omega, v).
+        UnitsError: The units or the twist order differ from mm, rad and (omega, v).
     """
     for name, wanted in (("jaw:lengthUnit", "mm"), ("jaw:angleUnit", "rad"), ("jaw:twistOrder", ["omega", "v"])):
         found = np.array(read_value(prim, name, where)).tolist()

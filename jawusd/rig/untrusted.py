@@ -177,7 +177,7 @@ def check_composed(stage: Usd.Stage, checked: list[Sdf.Layer]) -> None:
     """Check that a stage is composed only of layers returned by `check_file_access`.
 
     Raises:
-        RigError: It is composed of other layers.
+        RigError: The stage is composed of other layers.
     """
     known = {file_of_layer(layer).resolve() for layer in checked}
     for layer in stage.GetUsedLayers():

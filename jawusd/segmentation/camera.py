@@ -174,7 +174,7 @@ class CameraSegmenter:
 
 
 def _overlap(shares: NDArray[np.float32], drawn: NDArray[np.float32]) -> float:
-    """Return the intersection over union of a segmentation and its annotation, for the arch in which it is lower."""
+    """Return the intersection over union of a segmentation and its annotation; the lower value of the two arches."""
     a, b = shares > 0.5, drawn > 0.5
     return float(((a & b).sum((1, 2)) / np.maximum((a | b).sum((1, 2)), 1)).min())
 

@@ -117,7 +117,7 @@ def check_precision(name: str, found: torch.dtype, own: torch.dtype | None = Non
     """Check the dtype of an argument, and that of the layer it is passed to, if any.
 
     Raises:
-        TypeError: they differ, or are coarser than float32.
+        TypeError: the two dtypes differ, or are coarser than float32.
     """
     if own is not None and own not in _ALLOWED:
         raise TypeError(

@@ -26,9 +26,9 @@ from jawusd.viewer.widgets import set_theme
 
 log = logging.getLogger(__name__)
 
-# A browser answers a request with the frame in which it handles it, and runs at most two frames ahead of what is drawn.
-# Panels are sent afterwards, since building them blocks a browser without a GPU for almost a second. Hidden pages draw
-# no frames.
+# Number of requests that a browser must answer, and time to wait for each answer: a browser answers one request per
+# animation frame, at most two frames before the scene is drawn. Panels are sent afterwards, since building them blocks
+# a browser without a GPU for almost a second. Hidden pages draw no frames.
 _ANSWERS, _PATIENCE_S = 4, 3.0
 _SHOW_EVERY_S = 0.1  # minimum interval between live poses that are drawn
 

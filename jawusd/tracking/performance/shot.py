@@ -113,7 +113,7 @@ class _Take:
         self.fits: MutableMapping[int, FrameFit] = {}
 
     def first_pass(self) -> None:
-        """Align all frames in both directions from the start; go back over frames where that may correct them."""
+        """Align all frames in both directions from the start; align frames again whose poses may be wrong."""
         first, stop = self._shot.frames
         start = self._shot.start_frame
         attempts = Attempts(self._quick, self._weight)
@@ -138,7 +138,7 @@ class _Take:
     def _walk(self, way: range, near: FrameFit) -> Iterator[FrameFit]:
         """Yield the fits of frames in tracking order, starting next to a given fit.
 
-        If frames are followed again, their residuals are compared with those of all frames followed so far.
+        If frames are aligned again, their residuals are compared with those of all frames aligned so far.
         """
         again = any(frame in self.fits for frame in way)
         usual_px = usual_residual_px(self.fits.values()) if again else None

@@ -41,7 +41,8 @@ from jawusd.tracking.performance.instant import Expected, InstantSolver
 _PX_PER_MM = 2.0
 # assumed distance of the teeth along the optical axis, which determines the resolution of the views
 _ANYWHERE_MM = 200.0
-# Number of frames surveyed for large masks; numbers of frames searched if a start is accepted, and otherwise.
+# Number of frames surveyed for large masks; number of frames after which an acceptable start ends the search; and
+# maximum number of frames searched.
 _SURVEYED, _FRAMES_TRIED, _MOST_TRIED = 24, 4, 10
 # Candidate widths of the visible teeth [mm], from the front teeth to a whole arch, each a tenth larger than the one
 # before. They determine the distance from the camera.

@@ -35,7 +35,7 @@ class SkinFactor:
 
     Attributes:
         used: frames with a factor, shape (F,): those in which the face is known.
-        familiar: those of them in which the face resembles the training frames, shape (F,).
+        familiar: those used frames in which the face resembles the training frames, shape (F,).
     """
 
     def __init__(self, skin: SkinJaw, fps: float, wider: float = 1.0) -> None:

@@ -137,7 +137,7 @@ def _measured(
     correlation: float,
     rest: RestFrames,
 ) -> tuple[Array, Array, Array, ClosedBite | None]:
-    """Return poses (F, 2, 4, 4), covariances (F, 2, 6, 6), those of relative poses (F, 6, 6), and the closed bite.
+    """Return poses (F, 2, 4, 4) and covariances (F, 2, 6, 6), covariances of relative poses (F, 6, 6), and closed bite.
 
     `raw` are the poses as aligned, NaN where lost; `correlation` is the correlation length of outline errors [px].
     """
