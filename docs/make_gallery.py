@@ -47,6 +47,7 @@ from jawusd.rig import describe
 from jawusd.viewer.readouts import rest_places
 from jawusd.viewer.scene import preset_view
 from jawusd.viewer.server import Viewer
+from jawusd.viewer.widgets import set_theme
 
 ROOT = Path(__file__).resolve().parents[1]
 CAPTURE = ROOT / "examples" / "capture"
@@ -261,6 +262,7 @@ def viewer(out: Path, folder: Path) -> Path:
         (shown,) = served.pages.values()
         page.get_by_role("button", name="play", exact=True).click()
         page.get_by_role("button", name="pause", exact=True).click()
+        page.get_by_role("button", name="play", exact=True).wait_for()
         shown.motion.show(float(VIEWED_FRAME))
         if shown.footage is not None:
             page.wait_for_selector("img:visible")
@@ -277,6 +279,7 @@ def jaw(out: Path, folder: Path, step: int = STEP) -> Path:
         actor = viewed_actor(out)
         clip = actor.load_clip(actor.take)
         (shown,) = served.pages.values()
+        set_theme(shown.client.gui, dark=False)  # the first page of the documentation is light
         shown.scene.show_paths(False)
         target = preset_view(rest_places(actor.rig), "front")[0] + JAW_AIM_MM
         camera = shown.client.camera
