@@ -182,7 +182,7 @@ class SkinFollower:
         moved[near] = again[near]
         good = near | (ok & (alike(self._key[c], image, start, moved, side) >= _STILL_ALIKE))
         lost = np.flatnonzero(~good)
-        moved[lost] = _beside(start, moved, good, lost)
+        moved[lost] = _from_neighbours(start, moved, good, lost)
         again, found = self._anchored(c, image, start[lost], moved[lost], side)
         moved[lost[found]], good[lost[found]] = again[found], True
         out = np.full(self._tracker.pixels[c].shape, np.nan)
@@ -226,7 +226,7 @@ def _triangulated(matrices: Array, pixels: Array) -> Array:
     return out
 
 
-def _beside(start: Array, moved: Array, good: Mask, lost: Indices) -> Array:
+def _from_neighbours(start: Array, moved: Array, good: Mask, lost: Indices) -> Array:
     """Return where points of the key frame (N, 2) are expected if they move like their neighbours, shape (L, 2).
 
     Args:

@@ -197,7 +197,7 @@ def _is_capture(rig: Path | None) -> bool:
 
 
 def _name_changed_files(*folders: Path) -> None:
-    """Print which files of builds have changed since."""
+    """Print which files have changed since the builds."""
     for folder in folders:
         from jawusd.pipeline.state import changed_files
 

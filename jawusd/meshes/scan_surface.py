@@ -1,4 +1,4 @@
-"""Clean surface of a teeth scan, and the border between crown and gum on it by random walks that rarely cross creases.
+"""Clean surface of a teeth scan, and its border of crown and gum, found by random walks that rarely cross creases.
 
 A clean surface has merged points and no degenerate or duplicate faces; its components and creases are known. Seeds of
 the walks are vertices that are certainly crown or gum. A vertex is labelled crown if a random walk that starts there is

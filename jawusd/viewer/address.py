@@ -21,7 +21,7 @@ _PORTS = 1000  # number of ports tried
 
 
 class FirstPage:
-    """Serve viser's page at an address until viser listens there, so that a browser loads it meanwhile.
+    """Serve viser's page at an address until viser listens there, so that a browser can load it early.
 
     The page's own connection to viser is held until `close`; the page then connects again at once.
     """
@@ -60,7 +60,7 @@ class _Server(socketserver.ThreadingTCPServer):
     """Answer every request with the page."""
 
     daemon_threads = True
-    allow_reuse_address = os.name == "posix"  # elsewhere, another program could then take the port
+    allow_reuse_address = os.name == "posix"  # on Windows, another program could then take the port
     answer = b""
 
     def __init__(self, family: socket.AddressFamily, address: tuple[str, int]) -> None:
@@ -123,7 +123,7 @@ def check_address(host: str) -> socket.AddressFamily:
 
 
 def url_of(host: str, port: int) -> str:
-    """Return the address of a page, as people read it."""
+    """Return the URL of a page, for display."""
     return f"http://{'localhost' if is_loopback(host) else host}:{port}"
 
 

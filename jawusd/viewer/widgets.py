@@ -49,7 +49,7 @@ def begin_panel(client: viser.ClientHandle, name: str) -> None:
 
 
 def add_dark_checkbox(client: viser.ClientHandle) -> None:
-    """Add the checkbox for dark mode, which is on at first."""
+    """Add the checkbox for dark mode, which is checked by default."""
     box = client.gui.add_checkbox("dark page", True)
 
     async def darken(_: object) -> None:

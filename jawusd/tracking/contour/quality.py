@@ -187,9 +187,9 @@ def landmark_sigmas(T_upper_lower: Array, covariance: Array, landmarks: Array) -
 
 
 def widening(T_upper_lower: Array, covariance: Array, landmark: Array, least_mm: Array | float) -> Array:
-    """Return the factors >= 1 on covariances that give a landmark (3,) at least a standard deviation, shape (...).
+    """Return factors >= 1 on covariances (...) that raise the standard deviation of a landmark (3,) to `least_mm`.
 
-    `T_upper_lower` and `covariance` are as in `landmark_sigmas`; `least_mm` is 0 where nothing is to change. Unknown
+    `T_upper_lower` and `covariance` are as in `landmark_sigmas`; `least_mm` is 0 where nothing should change. Unknown
     covariances give 1.
     """
     sigma = landmark_sigmas(T_upper_lower, covariance, landmark[None])[..., 0]

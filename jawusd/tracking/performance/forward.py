@@ -66,7 +66,7 @@ class ForwardPass:
         return attempts.judged(alone, instant)
 
     def _other_starts(self, expected: Expected, instant: Instant) -> list[Pose]:
-        """Return further starts: the prediction, the last pose, and earlier jaw poses with the head on its masks."""
+        """Return further starts: the prediction, the last pose, and earlier jaw poses moved onto the masks."""
         jaws = [expected.pose.d, *(self._jaws if self._motion.blind.any() else ())]
         arch = 0 if instant.present[0].any() else 1
         scan, shifted = self._attempts.instants.solver.scans[arch], []

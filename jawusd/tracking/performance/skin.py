@@ -52,7 +52,7 @@ class SkinFactor:
         covariance = np.where(self.used[:, None, None], skin.covariance, np.eye(3))
         self._slope, fast = _slow_and_fast(covariance, 1.0 / fps)
         self._precision = wider * np.linalg.inv(fast)
-        self._keep = _kept(1.0 / fps)
+        self._correlation = _correlation(1.0 / fps)
 
     def started(self, fits: Sequence[FrameFit]) -> list[FrameFit]:
         """Return the fits, with d estimated from skin if the face is familiar and an arch was not found."""
@@ -86,7 +86,7 @@ class SkinFactor:
                 right += rows.T @ self._precision[k] @ residual
             system.add_frame(k, matrix, right)
         steps = np.diff(slow, axis=0)
-        weight = self._wider * self._keep / (1 - self._keep**2)
+        weight = self._wider * self._correlation / (1 - self._correlation**2)
         system.add_steps(slice(last, system.local), steps, np.full(3, weight))
 
     def _prior(self) -> Array:
@@ -95,7 +95,7 @@ class SkinFactor:
         For unit variance and correlation c between neighbours, (x' - c x)^2 / (1 - c^2) is split into
         c (x' - x)^2 / (1 - c^2) and terms in x^2 and x'^2.
         """
-        count, keep = len(self._d), self._keep
+        count, keep = len(self._d), self._correlation
         if count == 1:
             return np.full(1, self._wider)
         weight = np.full(count, (1 - keep) ** 2 / (1 - keep**2))
@@ -126,7 +126,7 @@ class SkinFilter:
         Returns:
             d and its covariance, and whether skin was used: only if the face is known.
         """
-        keep = _kept(seconds)
+        keep = _correlation(seconds)
         self._slow = keep * self._slow
         self._covariance = keep**2 * self._covariance + (1 - keep**2) * np.eye(SLOW)
         if not np.isfinite(skin.d).all():
@@ -153,7 +153,7 @@ def _slow_and_fast(covariance: Array, seconds: float) -> tuple[Array, Array]:
     return slope, (1 - _SHARE) * max(1.0, _FAST_S / seconds) * covariance
 
 
-def _kept(seconds: float) -> float:
+def _correlation(seconds: float) -> float:
     """Return the correlation of the slow error over a time [s]."""
     return float(np.exp(-seconds / _SLOW_S))
 

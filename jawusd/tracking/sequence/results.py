@@ -38,7 +38,7 @@ from jawusd.tracking.sequence.extrinsics import Extrinsics
 from jawusd.tracking.sequence.nuisance import Nuisances, interpolation_covariance, pose_response
 from jawusd.tracking.sequence.smoothing import smooth_poses
 
-#: Function that refines all measured poses by further information. Its arguments and results are poses (F, 2, 4, 4),
+#: Function that refines all measured poses with further information. Its arguments and results are poses (F, 2, 4, 4),
 #: NaN where lost, the covariances of their left twists about the world origin (F, 2, 6, 6), and those of
 #: T_upper_lower's left twists about the skull origin (F, 6, 6).
 Fusion = Callable[[Array, Array, Array], tuple[Array, Array, Array]]
