@@ -13,37 +13,36 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.optimize import least_squares
 
-from jawusd.base.arrays import Array, Indices, Mask
+from jawusd.base.arrays import Array, Indices
 from jawusd.base.errors import FittingError
 from jawusd.base.npz import TWIST_ORDER, UNITS
 from jawusd.evaluator import JawRig
 from jawusd.evaluator.skin import FAMILY, VERSION, Skin, components, skin_kernel
-from jawusd.fitting.face import COARSE_S, columns_at, incisal_error, offsets_between, refined_offset
+from jawusd.fitting.face import COARSE_S, columns_at, offsets_between, refined_offset
+from jawusd.fitting.skin_training import (
+    LEAST_FRAMES,
+    MOST_FRAMES,
+    blocks_of,
+    check_errors,
+    check_motion,
+    held_out_errors,
+    training_rows,
+)
 from jawusd.formats.atomic import write_npz_atomic
-from jawusd.geometry import make_transform, se3_exp, se3_inverse, transform_points
 
 #: Default root mean square shift [mm] and rotation [rad] of the head that remain in later frames after stabilisation,
 #: in addition to those in the training frames.
 HEAD_ERROR = (0.3, 0.0026)
-_LEAST_FRAMES, _FRAMES = 60, 300  # minimum number of frames with visible teeth, and maximum number of training frames
-_BLOCKS = 6  # number of contiguous blocks that are held out in turn
 _COMPONENTS, _SMOOTH, _INSIDE = 120, 14, 30  # numbers of components: all, smooth part, familiarity test
-_LEAST_MOVED_MM = 0.5  # minimum standard deviation of each parameter in the training frames; 12 subjects have 1.4 mm
 # Initial parameters of the kernel, typical of fitted ones: length, smooth part, linear part, noise.
 _START = (2.0, 3.0, 0.3, 0.001)
 _LOW, _HIGH = np.log([0.2, 0.01, 0.001, 1e-5]), np.log([20.0, 100.0, 100.0, 3.0])
 _STEPS, _MOST_TRIALS = np.log([3.0, 1.7]), 80
 _FALSE_ALARMS = 0.01  # fraction of held-out frames that are flagged as unfamiliar
 _TINY = 1e-9  # lower bound of the limit on the squared distance, needed for face data with a single column
-_CHIN_POINTS = 3
-# Maximum ratio of the prediction error to that of each baseline. Observed: at most 0.4 for 12 subjects, at least 1.0
-# when face data are paired with the wrong frames.
-_MOST_SHARE = 0.65
 _CLOCK_COMPONENTS = 12  # Number of principal components of the face data used to estimate its clock offset.
 _LEAST_EXPLAINED = 0.5  # Minimum fraction of the variance of opening and laterotrusion that these must explain.
-_NAMES = ("opening", "laterotrusion", "protrusion")
 
 
 def fit_skin(
@@ -55,7 +54,6 @@ def fit_skin(
     *,
     head_error: tuple[float, float] = HEAD_ERROR,
     names: Sequence[str] = (),
-    chin_as_good: bool = False,
 ) -> Skin:
     """Learn the jaw parameters d from facial skin.
 
@@ -73,7 +71,6 @@ def fit_skin(
             frames: root mean square shift [mm] and rotation about the points' centre [rad]. The predicted covariances
                 include this error.
         names: Names of the columns or points, stored in the file.
-        chin_as_good: Accept an error near or above that of a chin rigid with the bone.
 
     Returns:
         The map. In its meta, "errors_mm" contains the mean held-out errors at the incisal point: that of the map
@@ -91,19 +88,16 @@ def fit_skin(
     sigma = np.broadcast_to(np.asarray(sigma_d, dtype=np.float64), d.shape)
     flat = X.reshape(len(X), -1)
     usable = np.asarray(seen, dtype=bool) & np.isfinite(np.column_stack([flat, d, sigma])).all(axis=1)
-    rows = _chosen(usable)
+    rows = training_rows(usable)
     X, flat, d, sigma = X[rows], flat[rows], d[rows], sigma[rows]
-    _check_motion(flat, d, sigma)
-    blocks = np.array_split(np.arange(len(rows)), _BLOCKS)
+    check_motion(flat, d, sigma)
+    blocks = blocks_of(len(rows))
     arrays, held_out, variance = _process(flat, d, sigma, blocks)
     arrays["head_error"] = np.zeros((0, len(arrays["basis"])))
     if points:
         arrays["head_error"] = _head_motions(X.mean(axis=0), head_error, arrays)
-    guesses = {"skin": held_out, "carried": _carried(d, blocks), "mean": np.broadcast_to(d.mean(axis=0), d.shape)}
-    if points and X.shape[1] >= _CHIN_POINTS:
-        guesses["chin"] = _of_chin(rig, X, d, blocks)
-    errors = {name: incisal_error(rig, guess, d) for name, guess in guesses.items()}
-    _check_errors({name: value for name, value in errors.items() if name != "chin" or not chin_as_good})
+    errors = held_out_errors(rig, held_out, d, blocks, X)
+    check_errors(errors)
     strange = np.column_stack([variance, _outside(flat, blocks, float(arrays["scale"]))])
     arrays["familiar_limit"] = np.maximum(np.quantile(strange, 1 - _FALSE_ALARMS / 2, axis=0), _TINY)
     flagged = (strange > arrays["familiar_limit"]).any(axis=1)
@@ -135,7 +129,7 @@ def clock_offset(face_s: Array, X: Array, times_s: Array, d: Array) -> float:
     known = X[np.isfinite(X).all(axis=1)]
     if not len(known):
         raise FittingError("no frame has values in all columns of the face data.")
-    known = known[:: max(len(known) // _FRAMES, 1)]
+    known = known[:: max(len(known) // MOST_FRAMES, 1)]
     mean = known.mean(axis=0)
     f = (X - mean) @ np.linalg.svd(known - mean, full_matrices=False)[2][:_CLOCK_COMPONENTS].T
     tried = offsets_between(face_s, times_s)
@@ -154,7 +148,7 @@ def clock_offset(face_s: Array, X: Array, times_s: Array, d: Array) -> float:
 def _explained(f: Array, d: Array) -> float:
     """Return the smallest fraction of the variance of a column of d (N, n) that is linear in features (N, C)."""
     rows = np.isfinite(f).all(axis=1)
-    if rows.sum() < _LEAST_FRAMES:
+    if rows.sum() < LEAST_FRAMES:
         return 0.0
     design, d = np.column_stack([np.ones(rows.sum()), f[rows]]), d[rows]
     left = d - design @ np.linalg.lstsq(design, d, rcond=1e-6)[0]
@@ -169,46 +163,6 @@ def save_skin(path: str | os.PathLike[str], skin: Skin) -> None:
     """
     meta = {"units": UNITS, "twist_order": TWIST_ORDER, **skin.meta, "format": f"{FAMILY}/{VERSION}"}
     write_npz_atomic(path, {**skin.arrays, "meta": np.array(json.dumps(meta, sort_keys=True))})
-
-
-def _chosen(usable: Mask) -> Indices:
-    """Return the training frames, evenly spaced among the usable ones."""
-    rows = np.flatnonzero(usable)
-    if len(rows) < _LEAST_FRAMES:
-        raise FittingError(
-            f"{len(rows)} frames show the teeth and have values in all columns of the face data; at least "
-            f"{_LEAST_FRAMES} are needed.",
-            hint="Check that both files show the same performance, and that no point is hidden throughout.",
-        )
-    return rows[np.linspace(0, len(rows) - 1, min(len(rows), _FRAMES)).astype(int)]
-
-
-def _check_motion(flat: Array, d: Array, sigma: Array) -> None:
-    moved = d.std(axis=0)
-    least = int(np.argmin(moved))
-    if moved[least] < _LEAST_MOVED_MM:
-        raise FittingError(
-            f"the {_NAMES[least]} varies by {moved[least]:.2f} mm (standard deviation) where the teeth are visible; "
-            f"at least {_LEAST_MOVED_MM:g} mm is needed to learn it.",
-            hint="Record opening, both sides and forward movement with parted lips.",
-        )
-    if not np.ptp(flat, axis=0).any():
-        raise FittingError("all columns of the face data are constant.")
-    if not (sigma > 0).all():
-        raise FittingError(f"sigma of d must be positive, found {sigma.min():g} mm.")
-
-
-def _check_errors(errors: dict[str, float]) -> None:
-    called = {"carried": "holding the last d", "mean": "the mean d", "chin": "a chin rigid with the bone"}
-    for name, words in called.items():
-        if name in errors and errors["skin"] > _MOST_SHARE * errors[name]:
-            raise FittingError(
-                f"the jaw learned from the face has an error of {errors['skin']:.2f} mm at the incisal point on "
-                f"held-out frames; the error of {words} is {errors[name]:.2f} mm. At most {_MOST_SHARE:.0%} of that "
-                f"is accepted.",
-                hint="Check that face and jaw data show the same performance on one clock, and that the head is "
-                "stabilised. Add points or expressions; if a rigid chin is as good, use inverse kinematics (`rig.ik`).",
-            )
 
 
 def _process(flat: Array, d: Array, sigma: Array, blocks: list[Indices]) -> tuple[dict[str, Array], Array, Array]:
@@ -286,49 +240,3 @@ def _head_motions(points: Array, head_error: tuple[float, float], arrays: dict[s
     turns = np.cross(np.eye(3)[:, None], arms) * head_error[1]
     moved = np.concatenate([shifts, turns]).reshape(6, -1) / np.sqrt(3)
     return np.asarray(moved @ arrays["basis"].T / arrays["scale"])
-
-
-def _carried(d: Array, blocks: list[Indices]) -> Array:
-    """Return d of the last frame before each block, shape (M, 3); for the first block, of the frame after it."""
-    held = [d[b[0] - 1] if b[0] else d[b[-1] + 1] for b in blocks]
-    return np.concatenate([np.repeat(each[None], len(b), axis=0) for each, b in zip(held, blocks, strict=True)])
-
-
-def _of_chin(rig: JawRig, X: Array, d: Array, blocks: list[Indices]) -> Array:
-    """Return d (M, 3) of held-out blocks, by inverse kinematics from the skin points that follow the bone best."""
-    poses, found = rig.pose(d), np.empty_like(d)
-    for b in blocks:
-        others = np.delete(np.arange(len(d)), b)
-        T, on_bone, chosen = _on_bone(rig, X[others], poses[others])
-        found[b] = rig.ik(on_bone, transform_points(T, X[b][:, chosen])).d
-    return found
-
-
-def _on_bone(rig: JawRig, X: Array, poses: Array) -> tuple[Array, Array, Indices]:
-    """Fit points (F, N, 3) to the bone as if rigid with it.
-
-    Returns:
-        T_skull_face (4, 4), and for the points with the least residual their positions in the mandible (3, 3) and
-        their indices.
-    """
-    swing = transform_points(poses, rig.landmarks[:1])[:, 0]
-    moved = X.mean(axis=1)
-    # The skin follows the incisal point, so the search starts from the rotation between the two point clouds (Kabsch
-    # 1976).
-    U, _, Vt = np.linalg.svd((swing - swing.mean(axis=0)).T @ (moved - moved.mean(axis=0)))
-    R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
-    start = make_transform(R, rig.landmarks[0] - R @ X.mean(axis=(0, 1)))
-
-    def residual(unknown: Array, chosen: Indices) -> Array:
-        in_skull = transform_points(se3_exp(unknown[:6]) @ start, X[:, chosen])
-        return np.asarray(transform_points(poses, unknown[6:].reshape(-1, 3)) - in_skull)
-
-    def rest(T: Array, chosen: Indices) -> Array:
-        return np.asarray(transform_points(se3_inverse(poses) @ T, X[:, chosen]).mean(axis=0))
-
-    every = np.arange(X.shape[1])
-    first = np.concatenate([np.zeros(6), rest(start, every).ravel()])
-    chosen = np.argsort(np.square(residual(first, every)).sum(axis=(0, 2)))[:_CHIN_POINTS]
-    guess = np.concatenate([np.zeros(6), rest(start, chosen).ravel()])
-    unknown = least_squares(lambda x: residual(x, chosen).ravel(), guess, x_scale="jac").x
-    return se3_exp(unknown[:6]) @ start, unknown[6:].reshape(-1, 3), chosen

@@ -16,9 +16,11 @@ from jawusd.base.arrays import Array, Mask
 from jawusd.base.errors import FittingError
 from jawusd.capture.skin_points import SkinTracker
 from jawusd.evaluator import JawRig
-from jawusd.evaluator.skin import Skin, SkinJaw
-from jawusd.fitting.face import columns_at, in_head
-from jawusd.fitting.skin import clock_offset, fit_skin
+from jawusd.evaluator.skin import SkinJaw
+from jawusd.fitting.face import columns_at
+from jawusd.fitting.shot_skin import ShotJaw, jaw_of_points
+from jawusd.fitting.skin import clock_offset
+from jawusd.fitting.skin_points import in_head
 from jawusd.formats.capture import Capture
 from jawusd.geometry import Camera, se3_inverse, transform_point
 from jawusd.media.pixels import ColourPicture
@@ -129,7 +131,8 @@ class SkinOfFootage:
     """Jaw parameters of a shot, estimated from points on the skin in its footage; a function object for the solver.
 
     Attributes:
-        skin: the map from the points to d; None until it is learned.
+        learned: the jaw of the last call, and what it was learned from; None before.
+        points: number of points that it was learned from.
     """
 
     def __init__(
@@ -150,7 +153,8 @@ class SkinOfFootage:
                 hint="Film with a second camera, or follow the face in another program (--face).",
             )
         self._rig, self._cameras, self._footage, self._progress = rig, dict(cameras), footage, progress
-        self.skin: Skin | None = None
+        self.learned: ShotJaw | None = None
+        self.points = 0
 
     def __call__(self, frames: Array, d: Array, seen: Mask, heads: Array) -> SkinJaw:
         """Return the jaw parameters estimated from skin in some frames; see `tracking.performance.skin.SkinOf`.
@@ -160,18 +164,14 @@ class SkinOfFootage:
             FittingError: too few points on the skin can be followed, or the jaw cannot be learned from them.
         """
         X = in_head(self.followed(frames.astype(int).tolist(), d, seen, heads), heads, seen)
-        # Without skin, these frames would be interpolated; a chin rigid with the bone is not an available alternative.
-        self.skin = fit_skin(self._rig, X, d, seen, SIGMA_MM, head_error=(0.0, 0.0), chin_as_good=True)
-        found = self.skin(X)
-        # Closed lips always differ from the parted lips of the training frames, but their covariance is valid.
-        return found._replace(familiar=np.asarray(np.isfinite(found.d).all(axis=1)))
+        self.learned, self.points = jaw_of_points(self._rig, X, d, seen, SIGMA_MM), X.shape[1]
+        return self.learned.jaw
 
     def summary(self) -> dict[str, object]:
         """Return the number of points, of frames with visible teeth, and the held-out errors; empty before learning."""
-        skin = self.skin
-        if skin is None:
+        if self.learned is None:
             return {}
-        return {"points": skin.columns // 3, "frames": skin.meta["frames"], "errors_mm": skin.errors_mm}
+        return {"points": self.points, "frames": self.learned.frames, "errors_mm": self.learned.errors_mm}
 
     def followed(self, frames: list[int], d: Array, seen: Mask, heads: Array) -> Array:
         """Return the points on the skin in the world [mm], shape (F, N, 3), NaN where they are not found.

@@ -38,7 +38,7 @@ from skin_takes import Skin  # noqa: E402
 import jawusd  # noqa: E402
 from jawusd.base.errors import FittingError  # noqa: E402
 from jawusd.evaluator.skin import SkinJaw  # noqa: E402
-from jawusd.fitting import skin as fitting  # noqa: E402
+from jawusd.fitting import skin_training as fitting  # noqa: E402
 from jawusd.geometry import transform_points  # noqa: E402
 from jawusd.tracking.performance import motion  # noqa: E402
 from jawusd.tracking.performance.attempts import LARGEST_SIGMA  # noqa: E402
@@ -85,7 +85,7 @@ def scores(person: Skin, head: tuple[float, float]) -> list[float]:
     found, true = skin(Z), rig.encode(T).d
     error = person.errors_mm(rig.project(found.d), T)
     z2 = np.mean((found.d - true) ** 2 / np.einsum("fii->fi", found.covariance))
-    T_skull_face, on_bone, chosen = fitting._on_bone(rig, X[seen][::4], rig.pose(d[seen][::4]))
+    T_skull_face, on_bone, chosen = fitting.on_bone(rig, X[seen][::4], rig.pose(d[seen][::4]))
     chin = rig.ik(on_bone, transform_points(T_skull_face, Z[frames][:, chosen])).d
     chin_mm = person.errors_mm(chin, T[frames])[:, 0].mean()
     carried = person.errors_mm(np.broadcast_to(d[seen][-1], true.shape), T)[:, 0].mean()

@@ -32,7 +32,8 @@ def test_the_jaw_behind_closed_lips_is_learned_from_frames_with_visible_teeth():
     assert error.mean() < 2.0 < carried.mean() / 2
     assert told[-1] == (len(d), len(d))
     summary = skin.summary()
-    assert summary["points"] >= 12 and summary["errors_mm"]["skin"] < 0.65 * summary["errors_mm"]["chin"]
+    errors = summary["errors_mm"]
+    assert summary["points"] >= 12 and errors["skin"] < 0.4 * errors["carried"]
 
 
 def test_one_camera_or_hidden_teeth_are_refused():

@@ -1,0 +1,186 @@
+"""The jaw in a shot from points on the skin, learned in the frames of the same shot in which the teeth are visible.
+
+Each coordinate of a point follows a quadratic polynomial of d. What this leaves is described by a few components, for
+expressions, and by a variance of each coordinate. In the other frames, d is the most probable value given the points
+that are found (generalised least squares).
+
+Lips that close move the skin around them in ways that no frame with visible teeth shows. Every point therefore has an
+additional variance: the mean square of what the model leaves of its motion in the frames with hidden teeth, estimated
+in turn with d of these frames. Points that the lips move then count little; those at the chin and jaw line count most.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from jawusd.base.arrays import Array, Mask
+from jawusd.evaluator import JawRig
+from jawusd.evaluator.skin import SkinJaw
+from jawusd.fitting.skin_points import LEAST_MOVING
+from jawusd.fitting.skin_training import blocks_of, check_errors, check_motion, held_out_errors, training_rows
+
+_COMPONENTS = 12  # number of components of the motion that does not depend on d
+_FLOOR_MM = 0.05  # standard deviation of the points that is added to that in the training frames
+_LEAST_FOUND = 0.5  # fraction of the points found in a training frame
+_RIDGE, _FILLING = 0.01, 20  # weight on the terms of d; rounds that fill missing points by the components
+_ROUNDS, _ADAPTED = 5, 200  # rounds of estimating d and the additional variances, and most frames used for it
+_STEPS, _FARTHEST = 10, 6.0  # Gauss-Newton steps; largest distance from the mean d, in standard deviations
+_HEAD_ERROR = (2.0, 0.03)  # shift [mm] and turn [rad] by which the pose of the head may be wrong, per axis
+_PRIOR = 3.0  # standard deviation of d before any point is seen, relative to that in the training frames
+# Factor on the covariance: errors of neighbouring points are alike. See docs/explanation/constants.md.
+_WIDER = 3.0
+_MEDIAN_SQUARE = 0.455  # median of the square of a standard normal variable
+
+
+class ShotJaw(NamedTuple):
+    """The jaw in all frames of a shot.
+
+    Attributes:
+        jaw: d with covariance; NaN where too few points are found. Familiar wherever it is known.
+        frames: number of frames with visible teeth, from which it was learned.
+        errors_mm: mean held-out errors at the incisal point, see `fitting.skin.fit_skin`.
+    """
+
+    jaw: SkinJaw
+    frames: int
+    errors_mm: dict[str, float]
+
+
+def jaw_of_points(rig: JawRig, X: Array, d: Array, seen: Mask, sigma_mm: float) -> ShotJaw:
+    """Return the jaw in all frames of a shot.
+
+    Args:
+        rig: the subject's rig.
+        X: points on the skin relative to the head [mm], NaN where they are not found, shape (F, N, 3).
+        d: jaw parameters [mm], shape (F, 3).
+        seen: frames in which d was measured, shape (F,).
+        sigma_mm: standard deviation of d in these frames.
+
+    Raises:
+        FittingError: there are too few frames or too little motion, or the held-out error exceeds 65 % of that of a
+            baseline; a chin rigid with the bone is none, since without skin, hidden frames are interpolated.
+    """
+    usable = seen & (np.isfinite(X[..., 0]).mean(axis=1) >= _LEAST_FOUND)
+    rows = training_rows(usable)
+    check_motion(np.nan_to_num(X[rows].reshape(len(rows), -1)), d[rows], np.array(sigma_mm))
+    held_out = np.empty((len(rows), 3))
+    blocks = blocks_of(len(rows))
+    for block in blocks:
+        others = np.delete(rows, block)
+        held_out[block] = PointModel(X[others], d[others]).jaw(X[rows[block]])[0]
+    model = PointModel(X[rows], d[rows])
+    errors = held_out_errors(rig, held_out, d[rows], blocks, model.filled)
+    check_errors({name: value for name, value in errors.items() if name != "chin"})
+    hidden = X[~seen & (np.isfinite(X[..., 0]).sum(axis=1) >= LEAST_MOVING)]
+    found, covariance, _ = model.jaw(X, model.departures(hidden))
+    # errors of the polynomials, which are alike in all points: robust variances of the held-out errors
+    covariance = covariance + np.diag(np.median(np.square(held_out - d[rows]), axis=0) / _MEDIAN_SQUARE)
+    return ShotJaw(SkinJaw(found, covariance, np.asarray(np.isfinite(found).all(axis=1))), int(usable.sum()), errors)
+
+
+class PointModel:
+    """How points on the skin move with d and expressions.
+
+    Attributes:
+        filled: the points of the training frames (M, N, 3) [mm], with estimates where they are missing.
+    """
+
+    def __init__(self, X: Array, d: Array) -> None:
+        """Learn from points (M, N, 3) [mm], NaN where they are missing, and d (M, 3) [mm] of training frames."""
+        self._centre, self._size = d.mean(axis=0), d.std(axis=0)
+        self._mean = np.nanmean(X, axis=0)
+        moved = (X - self._mean).reshape(len(X), -1)
+        known = np.isfinite(moved)
+        terms = _terms((d - self._centre) / self._size)
+        normal = np.einsum("fp,fij->pij", known.astype(float), terms[:, :, None] * terms[:, None])
+        normal += _RIDGE * np.diag([0.0] + [1.0] * (terms.shape[1] - 1))
+        self._slope = np.linalg.solve(normal, (np.nan_to_num(moved).T @ terms)[..., None])[..., 0].T
+        left = np.where(known, moved - terms @ self._slope, 0.0)
+        for _ in range(1 if known.all() else _FILLING):
+            U, s, Vt = np.linalg.svd(left, full_matrices=False)
+            low = (U[:, :_COMPONENTS] * s[:_COMPONENTS]) @ Vt[:_COMPONENTS]
+            left = np.where(known, left, low)
+        self.filled = (left + terms @ self._slope).reshape(X.shape) + self._mean
+        free = terms.shape[1]
+        self._expressions = s[:_COMPONENTS, None] * Vt[:_COMPONENTS] / np.sqrt(len(X) - free)
+        count = np.maximum(known.sum(axis=0) - free - _COMPONENTS, 1)
+        self._head = _head_motions(self._mean)
+        self._variance = np.square(left - low).sum(axis=0) / count + _FLOOR_MM**2
+
+    def departures(self, hidden: Array) -> Array:
+        """Return the additional variances of points (N,) [mm^2] by points (F, N, 3) in frames with hidden teeth."""
+        found = np.zeros(len(self._mean))
+        if not len(hidden):
+            return found
+        hidden = hidden[np.linspace(0, len(hidden) - 1, min(len(hidden), _ADAPTED)).astype(int)]
+        known = np.isfinite(hidden[..., 0])
+        for _ in range(_ROUNDS):
+            left = self.jaw(hidden, found)[2]
+            square = np.where(known, np.square(np.nan_to_num(left)).mean(axis=2), 0.0).sum(axis=0)
+            found = square / np.maximum(known.sum(axis=0), 1)
+        return found
+
+    def jaw(self, X: Array, departures: Array | float = 0.0) -> tuple[Array, Array, Array]:
+        """Return d of frames from their points.
+
+        Args:
+            X: points (F, N, 3) [mm], NaN where they are not found.
+            departures: additional variances of the points (N,) [mm^2].
+
+        Returns:
+            d (F, 3) [mm] and its covariances (F, 3, 3) [mm^2], NaN where too few points are found; and what the terms
+            in d leave of the points, shape (F, N, 3) [mm].
+        """
+        moved = (X - self._mean).reshape(len(X), -1)
+        known, moved = np.isfinite(moved), np.nan_to_num(moved)
+        weight = known / (self._variance + np.repeat(np.broadcast_to(departures, len(self._mean)), 3))
+        # normal equations of the terms in d and of nuisances: errors of the head and expressions, with unit variances
+        rows, k = np.concatenate([self._slope, self._head, self._expressions]), len(self._slope)
+        every = (weight @ (rows[:, None] * rows).reshape(-1, rows.shape[1]).T).reshape(-1, len(rows), len(rows))
+        by_point = (weight * moved) @ rows.T
+        inner = np.linalg.inv(every[:, k:, k:] + np.eye(len(rows) - k))
+        normal = every[:, :k, :k] - every[:, :k, k:] @ inner @ every[:, k:, :k]
+        right = by_point[:, :k] - np.einsum("fij,fjk,fk->fi", every[:, :k, k:], inner, by_point[:, k:])
+        u, covariance = _solved(normal, right)
+        terms = _terms(u)
+        nuisances = np.einsum("fij,fj->fi", inner, by_point[:, k:] - np.einsum("fij,fj->fi", every[:, k:, :k], terms))
+        left = moved - terms @ self._slope - nuisances[:, : len(self._head)] @ self._head
+        few = known.sum(axis=1) < 3 * LEAST_MOVING
+        u[few], covariance[few] = np.nan, np.nan
+        covariance = _WIDER * covariance * self._size[:, None] * self._size
+        return self._centre + u * self._size, covariance, np.where(known, left, np.nan).reshape(X.shape)
+
+
+def _solved(normal: Array, right: Array) -> tuple[Array, Array]:
+    """Return the most probable u (F, 3) by normal equations of its terms (F, 10, 10), and its covariance (F, 3, 3)."""
+    u, prior = np.zeros((len(right), 3)), np.eye(3) / _PRIOR**2
+    for _ in range(_STEPS):
+        slopes = _slopes(u)
+        matrix = np.swapaxes(slopes, 1, 2) @ normal @ slopes + prior
+        towards = right - np.einsum("fij,fj->fi", normal, _terms(u))
+        downhill = np.einsum("fij,fi->fj", slopes, towards) - u @ prior
+        u = np.clip(u + np.linalg.solve(matrix, downhill[..., None])[..., 0], -_FARTHEST, _FARTHEST)
+    return u, np.asarray(np.linalg.inv(matrix), np.float64)
+
+
+def _terms(u: Array) -> Array:
+    """Return the terms (F, 10) of a quadratic polynomial of u (F, 3)."""
+    i, j = np.triu_indices(3)
+    return np.column_stack([np.ones(len(u)), u, u[:, i] * u[:, j]])
+
+
+def _slopes(u: Array) -> Array:
+    """Return the derivatives (F, 10, 3) of the terms."""
+    i, j = np.triu_indices(3)
+    unit = np.eye(3)
+    linear = np.broadcast_to(np.concatenate([np.zeros((1, 3)), unit]), (len(u), 4, 3))
+    return np.concatenate([linear, u[:, i, None] * unit[j] + u[:, j, None] * unit[i]], axis=1)
+
+
+def _head_motions(points: Array) -> Array:
+    """Return the motions (6, 3 N) of points (N, 3) [mm] by one standard deviation of each error of the head."""
+    shifts = np.broadcast_to(np.eye(3)[:, None] * _HEAD_ERROR[0], (3, len(points), 3))
+    turns = np.cross(np.eye(3)[:, None], points - points.mean(axis=0)) * _HEAD_ERROR[1]
+    return np.concatenate([shifts, turns]).reshape(6, -1)
