@@ -1,5 +1,6 @@
 """Every command in folders with unusual names: it works, or fails with one plain message."""
 
+import functools
 import json
 import os
 import shutil
@@ -69,27 +70,50 @@ def test_all_commands_are_called():
     assert {words[0] for words in calls("x").values()} == set(SUMMARIES)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("name", "locale"), [*((name, "UTF-8") for name in NAMES), ("signs", "ASCII"), ("not UTF-8", "ASCII")]
-)
-def test_no_name_of_a_folder_ends_a_command_in_a_traceback(files, tmp_path, name, locale):
-    place = os.path.join(os.fsencode(tmp_path), NAMES[name])
+IN_LOCALE = {"UTF-8": tuple(NAMES), "ASCII": ("signs", "not UTF-8")}
+
+
+@pytest.fixture(scope="module")
+def ended(files, tmp_path_factory):
+    """Return the function that says how every command ended in the folders of a locale, by name.
+
+    One process runs all of them: starting one takes longer than most commands. A name that the file system does not
+    support has no outcome.
+    """
+
+    @functools.cache
+    def ended_in(locale):
+        desk = tmp_path_factory.mktemp("desk")
+        names = [name for name in IN_LOCALE[locale] if copied(files, os.path.join(os.fsencode(desk), NAMES[name]))]
+        if locale == "UTF-8":  # a build of all stages; a name that they take, others take
+            with open(os.path.join(os.fsencode(desk), NAMES["signs"], b"list.txt"), "w") as captures:
+                captures.write("capture\n")
+        folders = [b"./" + NAMES[name] if NAMES[name].startswith(b"-") else NAMES[name] for name in names]
+        driver = ROOT / "tests" / "support" / "names_driver.py"
+        environment = {**os.environ, **LOCALES[locale], "PYTHONPATH": str(ROOT)}
+        command = [sys.executable, str(driver), *folders]
+        done = subprocess.run(command, cwd=desk, env=environment, capture_output=True, timeout=900, check=False)
+        assert done.returncode == 0, done.stderr[-3000:]
+        return dict(zip(names, json.loads(done.stdout), strict=True))
+
+    return ended_in
+
+
+def copied(files, place):
+    """Copy the inputs to a folder; tell whether the file system supports its name."""
     try:
         shutil.copytree(os.fsencode(files), place)
-    except OSError as error:
-        pytest.skip(f"no such names here: {error}")
-    whole = name == "signs" and locale == "UTF-8"  # a build of all stages; a name that they take, others take
-    if whole:
-        with open(os.path.join(place, b"list.txt"), "w") as captures:
-            captures.write("capture\n")
-    folder = b"./" + NAMES[name] if NAMES[name].startswith(b"-") else NAMES[name]
-    driver = ROOT / "tests" / "support" / "names_driver.py"
-    environment = {**os.environ, **LOCALES[locale], "PYTHONPATH": str(ROOT)}
-    command = [sys.executable, str(driver), folder]
-    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, timeout=900, check=False)
-    assert done.returncode == 0, done.stderr[-3000:]
-    found = json.loads(done.stdout)
+    except OSError:
+        return False
+    return True
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("locale", "name"), [(locale, name) for locale, names in IN_LOCALE.items() for name in names])
+def test_no_name_of_a_folder_ends_a_command_in_a_traceback(ended, name, locale):
+    found = ended(locale).get(name)
+    if found is None:
+        pytest.skip("no such names here")
     assert [(call, end["trace"]) for call, end in found.items() if end["trace"]] == []
     for call, end in found.items():
         assert end["code"] in KNOWN_CODES and "Traceback" not in end["err"], (call, end)

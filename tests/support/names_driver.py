@@ -1,6 +1,6 @@
-"""Run every command on the files of a folder, in one process: python names_driver.py FOLDER; prints how each ended.
+"""Run every command on the files of folders, in one process: python names_driver.py FOLDER ...; prints how each ended.
 
-The folder holds what `tests/cli/test_names_of_any_bytes.py` makes. It may be named relative to the working directory.
+A folder holds what `tests/cli/test_names_of_any_bytes.py` makes. It may be named relative to the working directory.
 """
 
 import contextlib
@@ -77,11 +77,12 @@ def ended(words):
 
 
 def main():
-    """Run all calls and print a JSON object."""
+    """Run all calls and print a JSON list with an object for each folder."""
     from jawusd.viewer.server import PageServer
 
     PageServer.wait = lambda self: self.stop()
-    print(json.dumps({name: ended(words) for name, words in calls(sys.argv[1]).items()}))
+    folders = sys.argv[1:]  # which `ended` replaces
+    print(json.dumps([{name: ended(words) for name, words in calls(folder).items()} for folder in folders]))
 
 
 if __name__ == "__main__":
