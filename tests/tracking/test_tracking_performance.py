@@ -157,7 +157,8 @@ def test_sigma_covers_what_a_biased_annotator_does_to_depth(jaw, scans, truth, t
     assert z2() > 4
 
 
-def test_a_wrong_mask_in_one_of_three_cameras_costs_no_frame(jaw, scans, truth, folder, tmp_path):
+@pytest.mark.parametrize(("count", "most_mm"), [(3, 0.1), (2, 0.3)])
+def test_a_wrong_mask_in_one_of_several_cameras_costs_no_frame(jaw, scans, truth, folder, tmp_path, count, most_mm):
     """A mask with a large patch beside the teeth is left out; the other masks of the frame are used."""
     spoilt, k = shutil.copytree(folder, tmp_path / "spoilt"), 8
     path = small_take.png(spoilt, "cam1", "lower", k)
@@ -165,8 +166,8 @@ def test_a_wrong_mask_in_one_of_three_cameras_costs_no_frame(jaw, scans, truth, 
     rows, columns = np.nonzero(mask)
     cv2.circle(mask, (int(columns.max()), int(rows.max())), int(np.ptp(columns)) // 3, 255, -1)
     cv2.imwrite(str(path), mask)
-    found = solved(jaw, scans, truth, spoilt, small_take.CAMERAS)
-    assert found.state[k] == SolveState.SOLVED and tip_error_mm(jaw, found, truth)[k] < 0.1
+    found = solved(jaw, scans, truth, spoilt, small_take.CAMERAS[:count])
+    assert found.state[k] == SolveState.SOLVED and tip_error_mm(jaw, found, truth)[k] < most_mm
     unused = np.argwhere(~found.use[seen()])
     np.testing.assert_array_equal(unused, [[np.flatnonzero(seen() == k)[0], 1, 1]])
 

@@ -142,19 +142,35 @@ class Attempts:
         return np.asarray(trial.use.any(1) & (rough | uncovered | few))
 
     def without_wrong_masks(self, trial: Trial, expected: Expected, instant: Instant) -> Trial:
-        """Leave out a single mask of each arch that does not fit, if the arch then fits at least two other masks."""
+        """Leave out a single mask of each arch that does not fit, if the arch then fits its other masks.
+
+        Each of two masks may fit without the other, so the result that is nearest to the expected pose is kept.
+        """
         for r in ARCHES:
-            if not self.bad(trial)[r] or trial.use[r].sum() <= FEWEST_MASKS:
-                continue  # if fewer masks would remain, a wrong pose is more likely than a wrong mask
-            masks = np.flatnonzero(trial.use[r])  # the mask that the scan covers least is tried first
-            for c in masks[np.argsort(-trial.uncovered_px[r, masks])]:
+            masks = np.flatnonzero(trial.use[r])
+            if not self.bad(trial)[r] or not self._spare(trial, r):
+                continue  # a wrong pose is more likely than a wrong mask
+            others = []
+            for c in masks.tolist():
                 use = trial.use.copy()
                 use[r, c] = False
-                other = self.attempt(expected.pose, expected, instant, use, self.config.wide_gates_px)
-                if not self.bad(other)[r]:
-                    trial = other
-                    break
+                others.append(self.attempt(expected.pose, expected, instant, use, self.config.wide_gates_px))
+            fitting = [other for other in others if not self.bad(other)[r]]
+            trial = min(fitting, key=lambda other: self._distance(expected, other), default=trial)
         return trial
+
+    def _spare(self, trial: Trial, arch: int) -> bool:
+        """Return whether head and jaw remain well known without one of the masks of an arch.
+
+        One of two masks suffices if both show the other arch and earlier frames tell where the jaw is about.
+        """
+        own, other = trial.use[arch].sum(), trial.use[1 - arch].sum()
+        return bool(own > FEWEST_MASKS or (own == FEWEST_MASKS <= other and self._residuals))
+
+    def _distance(self, expected: Expected, trial: Trial) -> float:
+        """Return the squared distance from the expected pose in standard deviations."""
+        step = self.instants.coordinates.step(expected.pose, trial.pose)
+        return float(expected.precision @ step**2)
 
     def judged(self, trial: Trial, instant: Instant) -> FrameFit:
         """Return the attempt as a frame fit, excluding arches that do not fit their masks."""
