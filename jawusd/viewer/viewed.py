@@ -5,18 +5,20 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from jawusd.base.arrays import Array, Mask
 from jawusd.evaluator import JawRig
-from jawusd.formats.capture import Bootstrap
 from jawusd.formats.mesh import Mesh
-from jawusd.formats.tracks import Tracks
-from jawusd.geometry import Camera
-from jawusd.viewer.motion import Clip
+
+if TYPE_CHECKING:  # pages of rigs need no captures, which take a tenth of a second to import
+    from jawusd.formats.capture import Bootstrap
+    from jawusd.formats.tracks import Tracks
+    from jawusd.geometry import Camera
+    from jawusd.viewer.motion import Clip
 
 #: Names of the fixed meshes (skull frame) and of the moving meshes (mandible frame).
 STILL, MOVING = ("skull", "upper_teeth", "upper_gum"), ("mandible", "lower_teeth", "lower_gum")
