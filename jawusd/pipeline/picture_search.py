@@ -74,9 +74,9 @@ class _Candidate:
     rows: Mapping[str, Rows]
 
     @property
-    def bridged(self) -> float:
-        """Fraction of the dividing line between the arches that crosses teeth instead of a gap, in the worst camera."""
-        return max(rows.bridged for rows in self.rows.values())
+    def rank(self) -> tuple[int, float]:
+        """Sort key, smaller for more promising frames: more cameras, then fewer teeth on the dividing line."""
+        return -len(self.rows), max(rows.bridged for rows in self.rows.values())
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,7 +122,7 @@ class PictureSearch(Generic[T]):
             seen += len(part)
             for turns, count in zip(hypotheses, _TRIED, strict=False):
                 candidates = self._candidates(part, turns, progress)
-                candidates = sorted(candidates, key=lambda candidate: candidate.bridged)[:count]
+                candidates = sorted(candidates, key=lambda candidate: candidate.rank)[:count]
                 for done, candidate in enumerate(candidates, start=1):
                     tried.append(candidate.frame)
                     found = self._at(candidate)
