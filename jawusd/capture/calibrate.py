@@ -187,9 +187,10 @@ def _advice(
                 f"below {_GOOD_RMS_PX:g} px): check for blur, a bent board, a zoom or a camera that moved."
             )
         if figure["coverage"] < _LITTLE_COVERAGE or figure["empty_corners"]:
-            empty = ", ".join(figure["empty_corners"]) or "parts"
+            corners_left = ", ".join(figure["empty_corners"])
+            unseen = f"the corners {corners_left}" if corners_left else "parts of the image"
             advice.append(
-                f"camera {name}: the board covered {figure['coverage']:.0%} of the image and left {empty} empty; "
+                f"camera {name}: the board covered {figure['coverage']:.0%} of the image and never reached {unseen}; "
                 "the lens model is extrapolated there, so keep the teeth out of that area."
             )
     if expected_mm > _LARGE_EXPECTED_MM:

@@ -60,8 +60,8 @@ Rigid = Annotated[
     list[str] | None,
     typer.Option(
         metavar="head=MARKERS",
-        help="Markers fixed to the head; points are expressed relative to them: names, numbers, or a "
-        "marker description. Names and numbers need --rest-frame. Default: the points are stabilised.",
+        help="Markers fixed to the head, by name, number or marker description; the points are expressed relative to "
+        "them. Names and numbers need --rest-frame. Without this option, the points must already be stabilised.",
     ),
 ]
 RestFrame = Annotated[

@@ -95,7 +95,7 @@ RigArg = Annotated[
 ]
 OptionalRigArg = Annotated[
     Path | None,
-    typer.Argument(help="Folder of a rig, actor.usda, another layer, model.npz or tracks.npz.", callback=_noted),
+    typer.Argument(help="Folder of a rig, its actor.usda or another layer, model.npz, or tracks.npz.", callback=_noted),
 ]
 
 

@@ -257,7 +257,7 @@ class AdditiveFormula:
         ops: Operations[N, Table],
         numbers: Numbers | None = None,
     ) -> RigidMotion[N]:
-        """Return the motion away from the closed bite (see `JawFormula`); the model has no scalars."""
+        """Return the motion away from the closed bite (see `JawFormula`); the model has no numbers."""
         first, second, third = (curve(f"curve{i}", x, tables, ops) for i, x in enumerate(d, start=1))
         twist = ops.split([x + y + z for x, y, z in zip(first, second, third)], 6)
         return twist_motion(triple(twist[:3]), triple(twist[3:]), ops)

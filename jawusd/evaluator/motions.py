@@ -233,7 +233,7 @@ class RigFrames:
         self._single_to_pose = np.concatenate([turn.reshape(9, 16), entries[:, 3], T_rest.reshape(1, 16)])
 
     def pose(self, motion: Motion) -> Array:
-        """Return the pose T_skull_mandible (4, 4) of one motion in floats."""
+        """Return the pose T_skull_mandible (4, 4) of one motion given as Python floats."""
         return np.array((*motion, 1.0)).dot(self._single_to_pose).reshape(4, 4)
 
     def poses(self, M: Array) -> Array:

@@ -86,7 +86,9 @@ def _robust_fit(basis: Array, values: Array, weights: Array) -> Array:
 
 
 def fit_gauge(u: Array, weights: Array, path: Gauge, shown: Mask) -> GaugeFit:
-    """Fit gothic arch and glide surface to incisal displacements u (N, 3) [mm], stiffer until the gauge is invertible.
+    """Fit gothic arch and glide surface to incisal displacements u (N, 3) [mm].
+
+    The stiffness is increased until the gauge is invertible.
 
     Args:
         path: the gauge of the habitual path alone.

@@ -43,7 +43,7 @@ def blocks_of(count: int) -> list[Indices]:
 
 
 def check_motion(flat: Array, d: Array, sigma: Array) -> None:
-    """Check that training frames can teach every parameter.
+    """Check that the training frames vary enough to learn every parameter.
 
     Args:
         flat: columns of the face (M, K).

@@ -33,7 +33,7 @@ LabelSource = Literal["automatic", "reviewed"]
 class ScanLabels:
     """Crown, gum and base labels of one scan."""
 
-    labels: NDArray[np.uint8]  # label of `formats.mesh` for each vertex of the scan file, shape (V,)
+    labels: NDArray[np.uint8]  # label of each vertex of the scan file, as in `formats.mesh`, shape (V,)
     source: LabelSource  # "automatic" if derived from the shape, "reviewed" if accepted by a user
     weak_share: float = 0.0  # fraction of the crown-gum border with weak geometric evidence, 0 to 1
 

@@ -76,7 +76,7 @@ def _coupling(w: Array, v: Array) -> Array:
         1 / 24 - a2 / 720 * (1 - a2 / 56 * (1 - a2 / 90 * (1 - a2 / 132))),
         (s * s / 2 + np.cos(s) - 1) / s**4,
     )
-    # (c2 - 3 (s - sin s - s^3/6)/s^5)/2 with the signs used in the literature
+    # the literature's (c2 - 3 (s - sin s - s^3/6)/s^5)/2, whose c2 and c3 have the opposite signs
     c3 = np.where(
         small,
         1 / 120 - a2 / 2520 * (1 - a2 / 48 * (1 - 2 * a2 / 165)),

@@ -42,7 +42,7 @@ _STOPS, _FARTHER = (0.5, 4.0), 1.25
 _BEFORE, _AFTER = 6, 2
 _NOISE = 1.0  # minimum 25th percentile of the changes around a run [of 255 levels] that is attributed to noise
 _FAR_BELOW = 0.2  # maximum change in a run relative to the 25th percentile of the changes around the run
-_REGULAR = 0.15  # fraction of repeated images above which the repetition counts as regular
+_REGULAR = 0.15  # number of short runs, as a fraction of all images, above which repetition counts as regular
 _MISSING_SHARE = 0.01  # maximum fraction of frames without an image for a rate to count as constant
 
 

@@ -67,8 +67,8 @@ class MaskReader:
         """Find the masks, and the meaning of their pixel values from samples of the whole take.
 
         Args:
-            path: a PNG pattern with one `%d` or `%06d` (the index of the image in the camera's video), or a video with
-                one mask per image, or per frame, of the camera's video; or a mask in memory.
+            path: a PNG pattern with one `%d` or `%06d` (the index of the image in the camera's video), a mask video
+                with one mask per image or per frame of the camera's video, or a mask in memory.
             timeline: timeline of the camera's video; if it is None, PNG files are numbered by frame.
             labels: for label images, the gray values of the requested arch and of the other arch.
             prepare: function applied to each mask in the background thread, such as `WorkingView.mask`.

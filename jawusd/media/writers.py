@@ -48,7 +48,7 @@ class VideoWriter:
         if not str(path).endswith(suffix):
             raise ValueError(f"{path}: expected the suffix {suffix} for a {'lossless' if lossless else 'H.264'} video")
         if min(size_px) < 2 or (not lossless and (size_px[0] % 2 or size_px[1] % 2)):
-            raise ValueError(f"size is {size_px} px; expected even sides of at least 2 px for H.264")
+            raise ValueError(f"size is {size_px} px; expected an even width and height of at least 2 px for H.264")
         if not fps > 0:
             raise ValueError(f"fps is {fps}; expected a positive number")
         self._size_px = size_px

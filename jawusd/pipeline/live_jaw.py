@@ -1,4 +1,4 @@
-"""The jaw in live frames, corrected with facial skin: rows of a face tracker are matched with the images by time."""
+"""Pose of the jaw in live frames, from teeth and facial skin; rows of a face tracker are matched to images by time."""
 
 from __future__ import annotations
 

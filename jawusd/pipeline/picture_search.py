@@ -34,11 +34,11 @@ _MOST_BRIDGED = 0.1
 # Minimum length of the head's unit up vector projected to the image plane; a shorter one does not determine how the
 # image is turned.
 _SHORTEST_UP = 0.5
-#: Limits of the fraction of the visible contour that matches the colours. Starts below `LEAST_FIT` are rejected: correct
-#: starts of 15 subjects reach 0.31 to 0.58, and those in single frames of one take 0.19 to 0.48. In images turned the
-#: wrong way, wrong starts reach 0.02 to 0.20, so a start that is not clear is compared with those of all orientations.
-#: A start above `_CLEAR_FIT` (several cameras) or `_CLEAR_FIT_SINGLE` (one camera, where depth may be wrong) ends the
-#: search.
+#: Limits of the fraction of the visible contour that matches the colours. Starts below `LEAST_FIT` are rejected:
+#: correct starts of 15 subjects reach 0.31 to 0.58, and those in single frames of one take 0.19 to 0.48. In images
+#: turned the wrong way, wrong starts reach 0.02 to 0.20, so a start that is not clear is compared with those of all
+#: orientations. A start above `_CLEAR_FIT` (several cameras) or `_CLEAR_FIT_SINGLE` (one camera, where depth may be
+#: wrong) ends the search.
 LEAST_FIT, _CLEAR_FIT, _CLEAR_FIT_SINGLE = 0.15, 0.25, 0.4
 
 T = TypeVar("T")

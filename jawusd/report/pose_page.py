@@ -82,7 +82,7 @@ def _field(grid: DistanceGrid, up: int, closed_mm: float) -> dict[str, object]:
 
 
 def _steps(values: NDArray[np.float32], low: float, high: float) -> NDArray[np.uint8]:
-    """Return values clipped to a range, in whole steps from its lower end."""
+    """Return values clipped to a range, as numbers of `_STEP_MM` above its lower end."""
     return np.round((np.clip(values, low, high) - low) / _STEP_MM).astype(np.uint8)
 
 

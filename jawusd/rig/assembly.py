@@ -44,7 +44,8 @@ def faults_of_assembly(actor: Usd.Prim) -> Iterator[Fault]:
     if skull is None:
         yield Fault("warning", actor, "has no active skull (jaw:skull).")
     elif skull.GetPath().HasPrefix(mandible.GetPath()) or mandible.GetPath().HasPrefix(skull.GetPath()):
-        yield Fault("error", actor, f"jaw:skull and jaw:mandible, {mandible.GetPath()}, move together.")
+        paths = f"jaw:skull ({skull.GetPath()}) and jaw:mandible ({mandible.GetPath()})"
+        yield Fault("error", actor, f"{paths} move together: they are the same prim, or one is below the other.")
     yield from _resets(actor, [prim for prim in (skull, mandible) if prim])
     yield from _hidden(actor, skull, mandible)
     yield from _joints(actor, mandible)

@@ -127,7 +127,7 @@ class DecoderTable:
         format: "grid" (twists over the three axes) or "curves" (three curves that are summed).
         axes: Values of d1, d2, d3 [mm], each array increasing.
         twists: Twists (omega [rad], v [mm]) in the skull frame, float32: (n1, n2, n3, 6), or (n1 + n2 + n3, 6).
-        max_error_mm: Largest distance to the exact model found at any vertex.
+        max_error_mm: Largest distance of a vertex from the exact model.
         error_samples: Number of valid d at which `max_error_mm` was measured.
 
     Raises:

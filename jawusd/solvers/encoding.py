@@ -106,7 +106,8 @@ def _descended(residual: Residual, x: Tensor, target: Tensor) -> tuple[Tensor, T
         r_trial, J_trial = residual(trial, target)
         cost_trial = r_trial.square().sum(dim=1)
         moving = (step.abs().amax(dim=1) > tolerance_mm) & (damping < MAX_DAMPING)
-        # the last step doubles the correct digits: accept it even if the improvement is below the rounding error
+        # the last step doubles the number of correct digits: accept it even if it improves by less than the rounding
+        # error
         taken = (cost_trial <= cost) | ~moving
         damping = torch.where(taken, (damping * 0.1).clamp(min=MIN_DAMPING), damping * 10.0)
         x, r = torch.where(taken[:, None], trial, x), torch.where(taken[:, None], r_trial, r)

@@ -40,7 +40,7 @@ _ROWS = 512  # number of rows compared at once with all candidates
 class Expansion(NamedTuple):
     """The signed distance (n,) [mm], its gradient (n, 3), and its Hessian (n, 3, 3) [1/mm] in two parts.
 
-    The part due to the rounding is positive semidefinite; the part due to the curvature along d1 may be indefinite.
+    The part due to the rounded edges is positive semidefinite; that due to the curvature along d1 may be indefinite.
     """
 
     distance: Tensor

@@ -105,7 +105,7 @@ def _listen(host: str, port: int) -> _Server:
 
 
 def check_address(host: str) -> socket.AddressFamily:
-    """Return the family of an address if it can be bound; otherwise, viser would search for a free port forever.
+    """Check that an address can be bound, and return its family; viser would search for a free port forever.
 
     Raises:
         OutputError: the address cannot be bound.

@@ -269,7 +269,7 @@ class Rendering:
         list(self._map(show, tasks))
 
     def samples(self, contour: Contour, r: int, c: int, pose: Array) -> tuple[Array, int]:
-        """Return the samples of a contour in a view, moved to a pose close to the drawn one.
+        """Return the samples of a contour in a view, warped to a pose close to the rendered one.
 
         Args:
             contour: contour of the arch; the drawing may be of a scan with fewer faces.

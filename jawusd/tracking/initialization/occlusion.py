@@ -43,7 +43,7 @@ class Occlusion:
     # point of the upper ones
     through: float
     same: float  # fraction of the lower surface that coincides with the upper one
-    # fraction of crown points directly above or below crowns of the other arch; the larger value of both arches
+    # fraction of crown points directly above or below crowns of the other arch; the larger of the two values
     opposite: float
     aside_mm: float  # distance between the centres of the arches along the occlusal plane [mm]
     # angle in the occlusal plane between the forward directions of both arches [rad]

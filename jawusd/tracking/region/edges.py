@@ -167,7 +167,7 @@ def _likeliest(r: Array, n: int, step: float, reach_px: float) -> int:
 
 @numba.njit(nogil=True, cache=True, inline="always")
 def _zero_crossing(r: Array, n: int, step: float, k: int) -> float:
-    """Return the position near index k at which the log ratio falls below 0 [px]; without one, the position of k."""
+    """Return the position [px] near index k at which the log ratio falls below 0, or else that of index k."""
     d = (k - n) * step
     near = np.inf
     for m in range(k - 2, k + 2):

@@ -137,7 +137,7 @@ class CondyleTerm:
     noise_px3: float  # variance of colour borders times correlation length [px^3]
 
     def accumulate(self, state: Solution, equations: NormalEquations) -> None:
-        """Add the squared condyle distances at the solution's poses, in units of the outline's sum of squares."""
+        """Add the squared deviations of the condyles from their prediction, weighted to match the outline's squares."""
         residual, slope, variance = self.motion.residual(relative_pose(state.poses[0], state.poses[1]))
         to_skull = se3_adjoint(se3_inverse(state.poses[0]))
         upper, lower = (slope @ to_skull @ se3_adjoint(translation(centre)) for centre in state.centres)
