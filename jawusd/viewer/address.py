@@ -105,7 +105,7 @@ def _listen(host: str, port: int) -> _Server:
 
 
 def check_address(host: str) -> socket.AddressFamily:
-    """Check that an address can be bound, and return its family; viser would search for a free port forever.
+    """Return the family of an address after checking that it can be bound; viser would try ports forever.
 
     Raises:
         OutputError: the address cannot be bound.

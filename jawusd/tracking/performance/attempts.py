@@ -162,7 +162,7 @@ class Attempts:
     def _spare(self, trial: Trial, arch: int) -> bool:
         """Return whether head and jaw remain well known without one of the masks of an arch.
 
-        One of two masks suffices if both show the other arch and earlier frames tell where the jaw is about.
+        One of two masks suffices if both cameras show the other arch, and earlier frames determine the expected pose.
         """
         own, other = trial.use[arch].sum(), trial.use[1 - arch].sum()
         return bool(own > FEWEST_MASKS or (own == FEWEST_MASKS <= other and self._residuals))
