@@ -205,7 +205,7 @@ def corner_matrix(path: Path, where: str, fx: float, fy: float, cx: float, cy: f
 
 
 def cameras_of_images(path: Path, images: Sequence[tuple[str, Camera]]) -> list[Camera]:
-    """Return one camera per physical camera, given (file, camera) of each image, sorted by name.
+    """Return one camera per physical camera, sorted by name, from the (file, camera) of each image.
 
     The camera's name is the image's folder (`cam0/0001.png` is cam0) or, without one, the file name (`cam0.png`).
 

@@ -320,7 +320,7 @@ _MODULES = {name: module for module, names in _NAMES.items() for name in names}
 class Commands(TyperGroup):
     """The group of all commands; listing them does not load their modules."""
 
-    # typer passes its public Context; the base class declares that of its private copy of click.
+    # Contexts are objects here: typer passes its public Context, the base class declares that of its copy of click.
 
     def __init__(self, **settings: object) -> None:
         super().__init__(**settings)  # type: ignore[arg-type]  # passed on unchanged

@@ -65,7 +65,8 @@ Rigid = Annotated[
     ),
 ]
 RestFrame = Annotated[
-    int | None, typer.Option(help="For --rigid: frame of the face that defines the marker positions on the head.")
+    int | None,
+    typer.Option(help="For --rigid: number of the frame of the face data that defines the marker positions."),
 ]
 HeadError = Annotated[
     tuple[float, float],

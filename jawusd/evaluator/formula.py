@@ -91,7 +91,7 @@ def soft_ramp(x: N, softness_mm: float, ops: Operations[N, Table]) -> N:
 
 
 def bent(x: N, ops: Operations[N, Table]) -> N:
-    """Return ``0.15 x^2 / sqrt(1 + x^2 / 16)`` [mm]: an opening that is quadratic near 0 and linear far from it."""
+    """Return ``0.15 x^2 / sqrt(1 + x^2 / 16)`` [mm]: a drop that is quadratic near 0 and linear far from it."""
     square = x * x
     return DROP_BEND * square / ops.sqrt(1.0 + square / DROP_SATURATION_MM2)
 

@@ -159,7 +159,7 @@ class AnchoredNumbers(NamedTuple):
     spread: Triple[float] | None
 
 
-#: A glide surface measured on scans, all or none; see `jawusd.evaluator.curves`.
+#: Arrays of a glide surface measured on scans, of which a model has all or none; see `jawusd.evaluator.curves`.
 GLIDE_ARRAYS: dict[str, ArraySpec] = {
     "glide_d2": ArraySpec("jaw:model:glideD2", ("glide knots of d2",), values="rising"),
     "glide_d2_factors": ArraySpec("jaw:model:glideD2Factors", ("glide knots of d2", "glide factors")),

@@ -191,7 +191,7 @@ def judge_rows(
 ) -> None:
     """Write d, residual, margin [mm] and reason (n, 6) of poses T (n, 4, 4); see `encoding.judge`.
 
-    Encoding and judging share one function because compiling that function takes a tenth of the total compile time.
+    Encoding and judging share one function: compiling a second one would take a tenth of the total compile time.
     """
     e, v = encoding_scratch(model), hull_scratch(bound)
     for row in range(len(T)):

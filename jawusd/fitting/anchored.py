@@ -1,7 +1,7 @@
 """The default model: rotation as a smooth function of the position of the lower incisal point.
 
-On the three-dimensional set of reachable poses, the displacement u of the incisal point p is itself a coordinate
-system, so omega = f(u), t = u + p - R(omega) p with f(0) = 0 describes any smooth three-parameter jaw. f is a smoothing
+On the three-dimensional set of reachable poses, the displacement u of the incisal point p serves as coordinates, so
+omega = f(u), t = u + p - R(omega) p with f(0) = 0 describes any smooth motion with three parameters. f is a smoothing
 polyharmonic spline. Fitting f alternates with projecting the captured poses onto it, so that noise in u does not bias
 f. Where no poses were captured, the spline follows predictions from the condylar paths, which have a low weight.
 

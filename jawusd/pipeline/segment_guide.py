@@ -24,8 +24,8 @@ if TYPE_CHECKING:
     from jawusd.tracking.region.tracker import RegionPose
 
 # Distance [mm] between the jaw poses from masks and from colours above which one of them must be wrong; correct poses
-# of three takes differed by at most 0.9 mm. `_FEW` and `_MANY` are the fractions of wrong or lost frames above which a
-# take is reported as partly unreliable, or as unusable.
+# of three takes differed by at most 0.9 mm. Fractions of wrong or lost frames above which a take is reported as partly
+# unreliable (`_FEW`) or unusable (`_MANY`).
 _APART_MM, _FEW, _MANY = 1.0, 0.03, 0.2
 GUIDE, _FAMILY = "guide.npz", "jawusd-guide"
 

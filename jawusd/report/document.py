@@ -203,7 +203,7 @@ def _bite(data: ReportData) -> str:
         off = f"{shift:.2f} \u00b1 {sigma_mm:.2f} mm and {turn:.2f} \u00b1 {sigma_deg:.2f} degrees"
         frames = f"frames {found['frames'][0]} to {found['frames'][-1]}"
         what = "was moved to the closed bite by" if found["applied"] else "deviates from the closed bite by"
-        said.append(f"According to {frames}, the lower scan {what} {off}.")
+        said.append(f"Judged by {frames}, the lower scan {what} {off}.")
     return " ".join(said)
 
 

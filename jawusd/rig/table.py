@@ -186,7 +186,8 @@ def build_table(rig: JawRig, vertices: Array, size: int = DEFAULT_SIZE) -> Decod
         size: Values per axis, 17, 33 or 65.
 
     Returns:
-        A grid, or three curves for an additive model, whose sum is exact between the axes.
+        A grid, or three curves for an additive model. The model has no cross terms, so interpolation along the axes
+        is the only error of the curves.
 
     Raises:
         RigError: An unsupported size, or bounds that allow no parameters.

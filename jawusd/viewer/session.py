@@ -97,8 +97,8 @@ class Session:
     def set_parameter(self, index: int, value: float) -> None:
         """Set d1, d2 or d3 (index 0 .. 2) [mm] from a slider; successive moves of one slider are a single undo step.
 
-        With `keep_valid`, a change of the opening scales d2 and d3 down until the pose is valid; changes of d2 and d3
-        stop at the bound.
+        With `keep_valid`, d2 and d3 are scaled down until the pose is valid if the opening changes; changes of d2 and
+        d3 stop at the bound.
 
         Raises:
             ValueError: the value is not finite.

@@ -81,8 +81,8 @@ class Solution:
     silhouette: OutlineSums  # sums over the matched samples of silhouettes and borders of the scans
     gingival_margin: OutlineSums  # sums over the matched samples of the crown-gum line
     centres: Array  # centres of the twists in world coordinates [mm], shape (2, 3)
-    scatters: Array  # first result of `scatter_of_tiles` per arch, summed over views, shape (2, 6, 6)
-    gum_scatters: Array  # second result of `scatter_of_tiles` per arch, summed over views, shape (2, 6, 6)
+    scatters: Array  # first result of `scatter_of_tiles` (outline errors) per arch, summed over views, shape (2, 6, 6)
+    gum_scatters: Array  # second result (gum-line errors) per arch, summed over views, shape (2, 6, 6)
     visible_px: Array  # contour length that could have been matched, per arch and view [px], shape (2, C)
     iterations: int  # number of linearised steps
 

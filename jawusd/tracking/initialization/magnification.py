@@ -1,8 +1,8 @@
 """Magnification of the masks relative to calibration and scans: wrong focal lengths, lenses and scan sizes.
 
-Poses cannot compensate for an image that is magnified about its principal point: over a take, distances between
-projected contours and mask edges grow with the distance from that point. Magnification and its change with the
-radius are estimated per camera, with poses, camera motions and outline biases eliminated.
+With two or more cameras, poses cannot compensate for an image that is magnified about its principal point: over a take,
+distances between projected contours and mask edges grow with the distance from that point. Magnification and its change
+with the radius are estimated per camera, with poses, camera motions and outline biases eliminated.
 """
 
 from __future__ import annotations

@@ -168,11 +168,12 @@ def _wrong_lenses(given: Setting) -> Iterator[Mistake]:
             setting = replace(given, cameras={**given.cameras, name: fitted})
             if zooms:
                 share = float(fitted.K[0, 0] / camera.K[0, 0] - 1.0)
-                kind, cause = "focal_length", f"with a focal length {share:+.1%}: its focal length is wrong"
+                kind = "focal_length"
+                cause = f"if its focal length is changed by {share:+.1%}: the calibrated focal length is wrong"
             else:
                 px = float(np.hypot(*(fitted.K[:2, 2] - camera.K[:2, 2])))
                 kind = "principal_point"
-                cause = f"with its images shifted by {px:.0f} px: its principal point is wrong, or it was turned"
+                cause = f"if its images are shifted by {px:.0f} px: its principal point is wrong, or it was turned"
             message = f"the calibration of camera {name} contradicts the picks; it agrees {cause}"
             hint = "Calibrate it again, with the lens and mode of the recording."
             yield Mistake(kind, message, hint, setting, True, name)

@@ -94,7 +94,7 @@ class Passes:
                 budget.note(frame, record is not None)
                 if record is not None:
                     return Begin(frame, record, self._walk)
-        raise TrackingError("the teeth were not found where they were lost")
+        raise TrackingError("the teeth were not found again in the frames in which they were lost")
 
     def _searched(self, search: LostSearch, lost: range, frame: int, near: Array) -> FrameRecord | None:
         """Return the record of a lost frame after a search near given poses (2, 4, 4), or None if it stays lost."""
