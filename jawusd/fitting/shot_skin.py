@@ -27,6 +27,9 @@ _LEAST_FOUND = 0.5  # fraction of the points found in a training frame
 _RIDGE, _FILLING = 0.01, 20  # weight on the terms of d; rounds that fill missing points by the components
 _ROUNDS, _ADAPTED = 5, 200  # rounds of estimating d and the additional variances, and most frames used for it
 _STEPS, _FARTHEST = 10, 6.0  # Gauss-Newton steps; largest distance from the mean d, in standard deviations
+# Opening beyond that of all training frames, in standard deviations, up to which d counts as known. See
+# docs/explanation/constants.md.
+_BEYOND = 1.0
 _HEAD_ERROR = (2.0, 0.03)  # shift [mm] and turn [rad] by which the pose of the head may be wrong, per axis
 _PRIOR = 3.0  # standard deviation of d before any point is seen, relative to that in the training frames
 # Factor on the covariance: errors of neighbouring points are alike. See docs/explanation/constants.md.
@@ -38,7 +41,8 @@ class ShotJaw(NamedTuple):
     """The jaw in all frames of a shot.
 
     Attributes:
-        jaw: d with covariance; NaN where too few points are found. Familiar wherever it is known.
+        jaw: d with covariance; NaN where too few points are found, or where they show a jaw far wider open than in
+            the training frames. Familiar wherever it is known.
         frames: number of frames with visible teeth, from which it was learned.
         errors_mm: mean held-out errors at the incisal point, see `fitting.skin.fit_skin`.
     """
@@ -77,7 +81,9 @@ def jaw_of_points(rig: JawRig, X: Array, d: Array, seen: Mask, sigma_mm: float) 
     found, covariance, _ = model.jaw(X, model.departures(hidden))
     # errors of the polynomials, which are alike in all points: robust variances of the held-out errors
     covariance = covariance + np.diag(np.median(np.square(held_out - d[rows]), axis=0) / _MEDIAN_SQUARE)
-    return ShotJaw(SkinJaw(found, covariance, np.asarray(np.isfinite(found).all(axis=1))), int(usable.sum()), errors)
+    known = model.covers(found)
+    found[~known], covariance[~known] = np.nan, np.nan
+    return ShotJaw(SkinJaw(found, covariance, known), int(usable.sum()), errors)
 
 
 class PointModel:
@@ -90,6 +96,7 @@ class PointModel:
     def __init__(self, X: Array, d: Array) -> None:
         """Learn from points (M, N, 3) [mm], NaN where they are missing, and d (M, 3) [mm] of training frames."""
         self._centre, self._size = d.mean(axis=0), d.std(axis=0)
+        self._widest = float((d[:, 0].max() - self._centre[0]) / self._size[0])
         self._mean = np.nanmean(X, axis=0)
         moved = (X - self._mean).reshape(len(X), -1)
         known = np.isfinite(moved)
@@ -108,6 +115,14 @@ class PointModel:
         count = np.maximum(known.sum(axis=0) - free - _COMPONENTS, 1)
         self._head = _head_motions(self._mean)
         self._variance = np.square(left - low).sum(axis=0) / count + _FLOOR_MM**2
+
+    def covers(self, d: Array) -> Mask:
+        """Return whether d (F, 3) [mm] is known and not far wider open than in the training frames, shape (F,).
+
+        Openings are extrapolated wrongly beyond these frames, with a small covariance. Below them, the closed bite is
+        near.
+        """
+        return np.asarray((d[:, 0] - self._centre[0]) / self._size[0] <= self._widest + _BEYOND)
 
     def departures(self, hidden: Array) -> Array:
         """Return the additional variances of points (N,) [mm^2] by points (F, N, 3) in frames with hidden teeth."""

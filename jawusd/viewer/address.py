@@ -6,6 +6,7 @@ import contextlib
 import errno
 import ipaddress
 import os
+import select
 import socket
 import socketserver
 import threading
@@ -46,8 +47,10 @@ class FirstPage:
         self.url = url_of(host, self.port)
 
     def release(self) -> int:
-        """Stop listening, and return the port for viser."""
+        """Answer what has connected, stop listening, and return the port for viser."""
         self._server.shutdown()
+        while select.select([self._server], [], [], 0)[0]:  # closing resets connections that are not yet accepted
+            self._server.handle_request()
         self._server.server_close()
         return self.port
 

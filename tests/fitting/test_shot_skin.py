@@ -74,6 +74,16 @@ def test_missing_points_widen_sigma_and_too_few_leave_a_frame_unknown(shot):
     assert found.frames == seen.sum() and found.errors_mm.keys() == {"skin", "carried", "mean", "chin"}
 
 
+def test_a_jaw_far_wider_open_than_in_the_training_frames_is_unknown(shot):
+    """Teeth are visible while the jaw is nearly closed; then it opens wide."""
+    person, X, d, seen, _, _ = shot
+    narrow = seen & (d[:, 0] < np.quantile(d[seen, 0], 0.6))
+    wide = seen & (d[:, 0] > d[narrow, 0].mean() + 6 * d[narrow, 0].std())
+    found = jaw_of_points(person.rig, X, d, narrow, 0.15).jaw
+    assert wide.sum() > 5 and not found.familiar[wide].any() and np.isnan(found.d[wide]).all()
+    assert np.isnan(found.covariance[wide]).all() and found.familiar[narrow | ~seen].all()
+
+
 def test_points_of_another_moment_are_refused(shot):
     person, X, d, seen, _, _ = shot
     late = X.copy()

@@ -80,6 +80,17 @@ def test_the_page_is_served_before_viser_is_imported_and_the_rig_read(folder):
     assert told == [early] and b"Viser" in early and viewer.url == first.url
 
 
+def test_connections_made_just_before_viser_takes_over_are_answered():
+    for _ in range(20):
+        first = FirstPage("127.0.0.1", 0)
+        pages = [asked(first, "GET / HTTP/1.1") for _ in range(5)]
+        first.release()
+        for page in pages:
+            assert page.recv(12) == b"HTTP/1.1 200"
+            page.close()
+        first.close()
+
+
 def test_nothing_is_served_after_a_rig_that_cannot_be_read(folder):
     (folder / "actor.usda").write_text("#usda 1.0\n")
     first = FirstPage("127.0.0.1", 0)
