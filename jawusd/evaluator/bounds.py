@@ -210,7 +210,7 @@ class SliceHull:
 def largest_share(outside: Callable[[Array], Mask], count: int, iterations: int) -> Array:
     """Return, by bisection, the largest fractions (count,) in [0, 1] for which ``outside`` is false."""
     low, high = np.zeros(count), np.ones(count)
-    for _ in range(iterations):
+    for _ in range(iterations if count else 0):
         share = 0.5 * (low + high)
         out = outside(share)
         high, low = np.where(out, share, high), np.where(out, low, share)

@@ -88,8 +88,7 @@ class Session:
         there are still none, both limits are the current value.
         """
         d = self.d
-        alone = np.array(self.rig.ranges(d[0])).reshape(2, 2)
-        found = np.array(self.rig.ranges(*d)).reshape(2, 2)
+        found, alone = np.moveaxis(np.reshape(self.rig.ranges(d[0], [d[1], 0.0], [d[2], 0.0]), (2, 2, 2)), 2, 0)
         for other in (alone, d[1:, None]):
             found = np.where(np.isfinite(found).all(axis=1, keepdims=True), found, other)
         return np.vstack([self.rig.d_range[0], found])

@@ -129,11 +129,16 @@ def solved(task: Task, draw: int, folder: Path, jaw: JawRig, count: int) -> Outc
     except TrackingError as error:
         outcome.refused = str(error)
         return outcome
-    relative = truth["T_upper_lower"]
+    scored = np.load(folder / "spoilt.npy") if task.spoilt else np.arange(len(found.frames))
+    judge(outcome, found, jaw, truth["T_upper_lower"], scored)
+    return outcome
+
+
+def judge(outcome: Outcome, found: Performance, jaw: JawRig, relative: np.ndarray, scored: np.ndarray) -> None:
+    """Write the figures of some frames of a solved shot to its outcome, from true poses of the jaw (F, 4, 4)."""
     gap = transform_point(jaw.pose(found.d), jaw.landmarks[0]) - transform_point(relative, jaw.landmarks[0])
     error, sigma = np.linalg.norm(gap, axis=-1), tracks_of(found, jaw).sigma_mm[:, 0]
     known = (found.state == SolveState.SOLVED) & (sigma < KNOWN_MM)
-    scored = np.load(folder / "spoilt.npy") if task.spoilt else np.arange(len(error))
     outcome.frames, outcome.known = len(scored), float(known[scored].mean())
     known &= np.isin(np.arange(len(error)), scored)
     if known.any():
@@ -143,7 +148,6 @@ def solved(task: Task, draw: int, folder: Path, jaw: JawRig, count: int) -> Outc
         outcome.silent = float((error > np.maximum(2 * sigma, SILENT_MM))[known].mean())
         outcome.z2 = float(np.einsum("fi,fij,fj->f", away, np.linalg.inv(covariance), away).mean() / 3)
         outcome.sigma_mm = float(np.median(sigma[known]))
-    return outcome
 
 
 def searched(capture: Capture, jaw: JawRig, truth: dict[str, np.ndarray]) -> tuple[Performance, float]:

@@ -71,9 +71,9 @@ def write_lips_capture(folder, seed, frames=100, size_px=(640, 360)):
     return write_take(Path(folder), f"lips_{seed}", seed, frames, plain_look(size_px), True)
 
 
-def write_look_capture(folder, seed):
-    """Write every fifth frame of a take of a drawn look, without picks; see `write_take`."""
-    return write_take(Path(folder), f"look_{seed}", seed, 60, draw_look(seed), False, 5)
+def write_look_capture(folder, seed, frames, every):
+    """Write every so many of the frames of a take of a drawn look, without picks; see `write_take`."""
+    return write_take(Path(folder), f"look_{seed}", seed, frames, draw_look(seed), False, every)
 
 
 def write_take(folder, name, seed, frames, look, lips_close, every=1):
