@@ -17,10 +17,17 @@ from jawusd.formats.poses import read_parameters
 from jawusd.formats.tracks import load_tracks
 from jawusd.geometry import transform_point, transform_points
 from jawusd.media.video import Video
+from jawusd.pipeline.calibrate import sync_cameras
 from jawusd.pipeline.cameras import load_cameras
 from jawusd.pipeline.solve import check_output, solve, solve_summary, write_solved
+from jawusd.pipeline.solve_videos import PreparedTeeth, VideoOptions, VideoShot
+from jawusd.pipeline.state import no_progress
+from jawusd.pipeline.subject import load_meshes, registered_meshes
 from jawusd.pipeline.workspace import open_capture
 from jawusd.rig.motion_read import read_poses_of_stage
+from jawusd.tracking.performance.coordinates import Pose
+from jawusd.tracking.region.appearance import LearnedColours
+from jawusd.tracking.region.rig_tracker import RigTracker
 
 EXAMPLE = ROOT / "examples" / "capture"
 COUNT = 12
@@ -96,6 +103,31 @@ def test_teeth_are_found_in_the_pictures_of_one_camera_without_picks(rig):
     assert found.camera_names == ("cam0",) and (found.state == SolveState.SOLVED).all()
     assert found.notes["start"]["by"] == "search"
     assert errors.mean() < 1.0 and errors.max() < 4 * found.sigma_d.max()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("corrected", [True, False])
+def test_one_camera_finds_the_jaw_again_if_it_was_predicted_too_far_in_front(rig, monkeypatch, corrected):
+    """The prediction is 9 mm too far in front; without starts nearer to the habitual path, 5 mm would remain."""
+    jaw, shot, frame = jawusd.load(rig), bare(0, 1, ["cam0"], picks=False), 60
+    if not corrected:
+        monkeypatch.setattr(RigTracker, "_with_habitual_starts", lambda tracker, expected, look, *found: found)
+    meshes, offsets = registered_meshes(load_meshes(shot), jaw.meta), sync_cameras(open_capture(EXAMPLE), no_progress)
+    cameras = {camera.name: camera for camera in load_cameras(shot)}
+    teeth = PreparedTeeth(shot, meshes, jaw, map)
+    video = VideoShot(shot, cameras, offsets["offsets"], teeth, jaw, VideoOptions(), no_progress)
+    with np.load(EXAMPLE / "truth" / "truth.npz") as truth:
+        row = truth["frames"].tolist().index(frame)
+        near = Pose(truth["T_world_upper"][row], jaw.encode(truth["T_upper_lower"][row]).d)
+        wanted = jaw.encode(truth["T_upper_lower"][row + 1]).d
+    take = video.take
+    colours = LearnedColours(take._scans, take._shot.cameras, take._axes)
+    tracker = RigTracker(take._rough, colours, whole=take._instants)
+    first, second = video._cuts(take._shot.cameras, take._centre(near), range(frame, frame + 2))
+    found = tracker.begin(first, near).pose.d
+    tracker.carry(found + [-3.0, 0.0, 9.0], np.full(3, 0.01))
+    error_mm = np.abs(tracker.step(second).pose.d - wanted).max()
+    assert error_mm < 1.0 if corrected else error_mm > 2.0
 
 
 @pytest.mark.slow

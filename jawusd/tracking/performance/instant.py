@@ -37,10 +37,11 @@ class Expected:
 
 @dataclass(frozen=True, eq=False)
 class Aligned:
-    """An alignment: the pose and its matched outlines."""
+    """An alignment: the pose, its matched outlines, and the prior on the pose."""
 
     pose: Pose
     solution: Solution
+    expected: Expected
 
 
 class Equations(NamedTuple):
@@ -93,7 +94,7 @@ class InstantSolver:
             left = self.config.gates_after(left, moved_mm)
         if moved_mm > self.config.judged_mm:
             state = self.linearise(pose, views, use, rendering, self.config.final_gate_px[1], final=True)
-        return Aligned(pose, state)
+        return Aligned(pose, state, expected)
 
     def linearise(
         self,

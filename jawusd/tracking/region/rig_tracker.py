@@ -87,7 +87,7 @@ class RigTracker:
             arches = self._coordinates.arches(pose)
             look = _InstantImages(self._instants, self._colours, cut(arches), arches, self._whole)
             rough = look.align(pose, Expected(pose, sigma**-2.0), FAR_GATES_PX)
-            found = look.polished(rough, Expected(pose, sigma**-2.0))
+            found = look.polished(rough)
             pose = found.pose
             look.learn(pose, FIRST_RATES)
         self.expected = Expected(pose, sigma**-2.0)
@@ -115,7 +115,8 @@ class RigTracker:
         usual = self._usual_share()
         least = np.where(unsure, AGAIN, _LOST) * usual
         rough, look = self._best(expected, look, cut, frames, least)
-        share, found = fitting_share(rough.solution), look.polished(rough, expected)
+        rough, found = self._with_habitual_starts(expected, look, rough, look.polished(rough))
+        share, fine = fitting_share(rough.solution), fitting_share(found.solution)
         trusted = (share >= least) & (matched_px(found.solution) >= self._least_px)
         if not trusted.any():
             found = replace(found, pose=expected.pose)
@@ -127,7 +128,7 @@ class RigTracker:
             self._remember(share)
         self._motion.take(found.pose, trusted)
         fit = look.fit(found, trusted, self._free_focal)
-        return replace(fit, uncertain=bool((share < THOROUGH.uncertain * usual).any()))
+        return replace(fit, uncertain=bool((np.minimum(share, fine) < THOROUGH.uncertain * usual).any()))
 
     def carry(self, d: Array, variance_mm2: Array) -> None:
         """Predict the next frame from d of another source; see `Prediction.carry`."""
@@ -182,6 +183,25 @@ class RigTracker:
         far_away = self._searched(found, expected, look)
         return far_away if (fitting_share(far_away.solution) >= least).all() else found, look
 
+    def _with_habitual_starts(
+        self, expected: Expected, look: _InstantImages, rough: Aligned, found: Aligned
+    ) -> tuple[Aligned, Aligned]:
+        """Return a rough alignment and its refinement; with one camera, also align from poses nearer to habitual ones.
+
+        One camera hardly shows the distance of the jaw, so a wrong distance can persist although teeth are visible.
+        """
+        alone = look.use.any(axis=0).sum() == 1 and not (self._effort.in_turn and self._failed > self._effort.searches)
+        if not alone or not (fitting_share(found.solution) < THOROUGH.uncertain * self._usual_share()).any():
+            return rough, found
+        gates = self._effort.wide_px or self._effort.gates_px
+        for kept in ([1.0, 0.0, 1.0], [1.0, 1.0, 0.0]):  # no laterotrusion, no protrusion
+            start = replace(expected.pose, d=expected.pose.d * kept)
+            trial = look.align(start, Expected(start, _loose(expected)), gates)
+            fine = look.polished(trial)
+            if _better(found, fine) is fine:
+                rough, found = trial, fine
+        return rough, found
+
     def _best_in_turn(
         self, found: Aligned, expected: Expected, look: _InstantImages, cut: Cut
     ) -> tuple[Aligned, _InstantImages]:
@@ -211,8 +231,7 @@ class RigTracker:
         head, jaw = found.pose.head, self._coordinates.jaw
         places = [head @ jaw.pose(d) for d in self._jaws]
         order = rank_by_colour(places, look.views, self._instants.solver.scans, 1, look.upper_crowns(found.pose))
-        brief, loose = [], expected.precision.copy()
-        loose[JAW] = LARGEST_SIGMA[JAW] ** -2.0
+        brief, loose = [], _loose(expected)
         for k in order[: self._effort.jaws]:
             start = replace(found.pose, d=self._jaws[k])
             brief.append(look.align(start, Expected(start, loose), TRIAL_GATES_PX))
@@ -244,13 +263,13 @@ class _InstantImages:
         weight = np.full(2, 1.0 / BORDER_PX3)
         return self._instants.align(start, self.views, self.use, gates_px, expected, weight, self._rendering)
 
-    def polished(self, found: Aligned, expected: Expected) -> Aligned:
-        """Refine an alignment with all faces; visibility is not recomputed."""
+    def polished(self, found: Aligned) -> Aligned:
+        """Refine an alignment with all faces and the same prior; visibility is not recomputed."""
         if self._whole is None:
             return found
         weight = np.full(2, 1.0 / BORDER_PX3)
         self._counting = views = self._colours.counting(self.views)
-        return self._whole.align(found.pose, views, self.use, LAST_GATES_PX, expected, weight, self._rendering)
+        return self._whole.align(found.pose, views, self.use, LAST_GATES_PX, found.expected, weight, self._rendering)
 
     def upper_crowns(self, pose: Pose) -> list[Mask]:
         """Return masks of the pixels that upper crowns cover at a pose, one per view."""
@@ -275,6 +294,13 @@ class _InstantImages:
         solution = instants.linearise(found.pose, self.views, use, self._rendering, gate, True, matched)
         growth = growth_of(matched, solution.poses, solution.centres, self.views)
         return FrameFit(found.pose, solution, use, use, unknown, growth)
+
+
+def _loose(expected: Expected) -> Array:
+    """Return the precisions (9,) of a prior without knowledge of the jaw."""
+    out = expected.precision.copy()
+    out[JAW] = LARGEST_SIGMA[JAW] ** -2.0
+    return out
 
 
 def _better(one: Aligned, other: Aligned) -> Aligned:
