@@ -171,12 +171,15 @@ class TwoWays(Generic[P]):
         return None
 
     def unconfirmed(self, follow: Callable[[range, P], Iterator[P]]) -> dict[int, float]:
-        """Return minimum standard deviations of the lower teeth [mm] near lost frames, by frame.
+        """Return minimum standard deviations of the lower teeth [mm] near lost frames and jumps, by frame.
 
         Just before a tracker loses the teeth, or after it has found them, a pose may be wrong although it fits. From
         the frame next to each loss, the take is therefore followed away from the loss until a trusted pose is
         confirmed. Up to that frame, the standard deviation is at least the distance between the known and the new pose;
         next to the loss, it is also at least the second difference of the motion.
+
+        Where the jaw still accelerates implausibly, the poses on one side are wrong. The take is followed from each
+        side into the other one; where the poses of both sides fit about equally well, neither is confirmed.
 
         Args:
             follow: as in `Begin`.
@@ -187,7 +190,31 @@ class TwoWays(Generic[P]):
                 if beside in self.frames:
                     for frame, away_mm in self._doubts(beside, both_ways(beside, self.frames)[ahead], follow):
                         least_mm[frame] = max(away_mm, least_mm.get(frame, _UNCONFIRMED_MM))
+        for before in self._jumps():
+            for side, ahead in ((before + 1, 1), (before, 0)):
+                for frame, away_mm in self._contradicted(both_ways(side, self.frames)[ahead], self.known[side], follow):
+                    least_mm[frame] = max(away_mm, least_mm.get(frame, _UNCONFIRMED_MM))
         return least_mm
+
+    def _jumps(self) -> list[int]:
+        """Return the frames after which the jaw accelerates implausibly although both arches were found."""
+        found = [frame for frame in self.frames if self.known[frame].found.all()]
+        runs = [range(frame - 1, frame + 2) for frame in found[1:-1]]
+        whole = [run for run in runs if all(frame in self.frames and self.known[frame].found.all() for frame in run)]
+        return [run[1] for run in whole if self._bend_mm(run) > self.jump_mm]
+
+    def _contradicted(
+        self, way: range, pose: P, follow: Callable[[range, P], Iterator[P]]
+    ) -> Iterator[tuple[int, float]]:
+        """Yield the frames whose poses differ from those followed from another frame, and do not fit better [mm]."""
+        for frame, other in zip(way, follow(way, pose), strict=False):
+            old = self.known[frame]
+            away_mm = self._apart_mm(other, old)
+            if not (old.found.all() and other.found.all()) or away_mm < _SAME_MM:
+                return
+            if self.fit_px(old) > self.margin * self.fit_px(other):
+                return
+            yield frame, away_mm
 
     def _doubts(
         self, beside: int, way: range, follow: Callable[[range, P], Iterator[P]]

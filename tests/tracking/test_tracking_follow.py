@@ -211,6 +211,7 @@ def test_progress_counts_the_frames_followed():
 def test_poses_that_nothing_confirms_are_uncertain():
     """Lost from 20 on, wrong from 17 on; the way back differs there, and agrees with 16."""
     known = take(range(20, 30), {frame: Pose(frame + 3.0) for frame in (17, 18, 19)})
+    known.jump_mm = np.inf
     tracker = Tracker({18: Pose(21.5), 17: Pose(18.0)})
     assert known.unconfirmed(tracker) == pytest.approx({19: 0.5, 18: 0.5, 17: 2.0})
     assert tracker.asked == [(22.0, list(range(18, 9, -1)))]
@@ -220,6 +221,13 @@ def test_poses_that_nothing_confirms_are_uncertain():
 def test_a_pose_that_fits_clearly_better_needs_no_confirmation(fit, doubted):
     known = take(range(20, 30), {17: Pose(17.0, fit=fit)})
     assert sorted(known.unconfirmed(Tracker({18: Pose(21.5), 17: Pose(18.0)}))) == doubted
+
+
+@pytest.mark.parametrize(("fit", "doubted"), [(1.0, range(20, 30)), (1.1, ())])
+def test_poses_after_a_jump_are_uncertain_unless_they_fit_clearly_better(fit, doubted):
+    """From 20 on, poses are 3 mm from those followed from 19; before it, both agree."""
+    known = take((), {frame: Pose(frame + 3.0, fit=fit) for frame in range(20, 30)})
+    assert known.unconfirmed(Tracker()) == dict.fromkeys(doubted, 3.0)
 
 
 def test_both_sides_of_a_loss_are_uncertain():
