@@ -192,7 +192,8 @@ class TwoWays(Generic[P]):
                         least_mm[frame] = max(away_mm, least_mm.get(frame, _UNCONFIRMED_MM))
         for before in self._jumps():
             for side, ahead in ((before + 1, 1), (before, 0)):
-                for frame, away_mm in self._contradicted(both_ways(side, self.frames)[ahead], self.known[side], follow):
+                way = both_ways(side, self.frames)[ahead]
+                for frame, away_mm in self._unlike(way, follow(way, self.known[side])):
                     least_mm[frame] = max(away_mm, least_mm.get(frame, _UNCONFIRMED_MM))
         return least_mm
 
@@ -203,19 +204,6 @@ class TwoWays(Generic[P]):
         whole = [run for run in runs if all(frame in self.frames and self.known[frame].found.all() for frame in run)]
         return [run[1] for run in whole if self._bend_mm(run) > self.jump_mm]
 
-    def _contradicted(
-        self, way: range, pose: P, follow: Callable[[range, P], Iterator[P]]
-    ) -> Iterator[tuple[int, float]]:
-        """Yield the frames whose poses differ from those followed from another frame, and do not fit better [mm]."""
-        for frame, other in zip(way, follow(way, pose), strict=False):
-            old = self.known[frame]
-            away_mm = self._apart_mm(other, old)
-            if not (old.found.all() and other.found.all()) or away_mm < _SAME_MM:
-                return
-            if self.fit_px(old) > self.margin * self.fit_px(other):
-                return
-            yield frame, away_mm
-
     def _doubts(
         self, beside: int, way: range, follow: Callable[[range, P], Iterator[P]]
     ) -> Iterator[tuple[int, float]]:
@@ -223,10 +211,17 @@ class TwoWays(Generic[P]):
         near = range(beside, beside + 3 * way.step, way.step)
         bent = all(frame in self.frames and self.known[frame].found.all() for frame in near)
         yield beside, self._bend_mm(near) if bent else 0.0
-        for frame, other in zip(way, follow(way, self.known[beside]), strict=False):
+        yield from self._unlike(way, follow(way, self.known[beside]), least_trust=2)
+
+    def _unlike(self, way: range, followed: Iterator[P], least_trust: int = 0) -> Iterator[tuple[int, float]]:
+        """Yield the frames up to the first confirmed pose, and how far known and followed poses are apart [mm].
+
+        A pose is confirmed if it equals the followed one or fits clearly better, and is trusted enough; see `trust`.
+        """
+        for frame, other in zip(way, followed, strict=False):
             old, away_mm = self.known[frame], self._apart_mm(other, self.known[frame])
             clear = away_mm < _SAME_MM or self.fit_px(old) > self.margin * self.fit_px(other)
-            if not (old.found.all() and other.found.all()) or (trust(old) == 2 and clear):
+            if not (old.found.all() and other.found.all()) or (trust(old) >= least_trust and clear):
                 return
             yield frame, away_mm
 
