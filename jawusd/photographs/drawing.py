@@ -158,7 +158,7 @@ class Outlines:
 def split_teeth(scan: Scan, T_anatomical_scan: Array, arch: int) -> Crowns:
     """Return the crowns of a scan as connected pieces, with a substitute gum surface if the scan has no gum.
 
-    In renderings, this surface occludes teeth on the far side of the arch, as gum does in photographs.
+    In renderings, this surface lies in front of teeth on the far side of the arch, as gum does in photographs.
 
     Args:
         scan: one arch.

@@ -199,10 +199,9 @@ class TwoWays(Generic[P]):
 
     def _jumps(self) -> list[int]:
         """Return the frames after which the jaw accelerates implausibly although both arches were found."""
-        found = [frame for frame in self.frames if self.known[frame].found.all()]
-        runs = [range(frame - 1, frame + 2) for frame in found[1:-1]]
-        whole = [run for run in runs if all(frame in self.frames and self.known[frame].found.all() for frame in run)]
-        return [run[1] for run in whole if self._bend_mm(run) > self.jump_mm]
+        runs = [range(frame - 1, frame + 2) for frame in self.frames[1:-1]]
+        found = [run for run in runs if all(self.known[frame].found.all() for frame in run)]
+        return [run[1] for run in found if self._bend_mm(run) > self.jump_mm]
 
     def _doubts(
         self, beside: int, way: range, follow: Callable[[range, P], Iterator[P]]

@@ -72,7 +72,7 @@ def write_lips_capture(folder, seed, frames=100, size_px=(640, 360)):
 
 
 def write_look_capture(folder, seed, frames, every):
-    """Write every so many of the frames of a take of a drawn look, without picks; see `write_take`."""
+    """Write a take of a drawn look without picks, with one of every `every` frames; see `write_take`."""
     return write_take(Path(folder), f"look_{seed}", seed, frames, draw_look(seed), False, every)
 
 
