@@ -20,7 +20,7 @@ from jawusd.media import live_source
 from jawusd.pipeline.calibrate import sync_cameras
 from jawusd.pipeline.cameras import load_cameras
 from jawusd.pipeline.live_jaw import LiveFrame, LiveJaw, LiveSkin
-from jawusd.pipeline.picture_search import LEAST_FIT, arches_apart, orientations, rough_masks
+from jawusd.pipeline.picture_search import arches_apart, least_fit, orientations, rough_masks
 from jawusd.pipeline.skin import SkinOptions
 from jawusd.pipeline.solve_videos import PreparedTeeth, VideoOptions, VideoShot
 from jawusd.pipeline.state import no_progress
@@ -310,7 +310,7 @@ class _Follower:
 
         centre = teeth_centre(self._teeth.scans, self._take.coordinates.arches(near))
         cutter = Cutter(self._cameras, self._teeth.scans, centre, self._pool)
-        if self._take.begin(cutter.cut(pictures), near) >= LEAST_FIT:
+        if self._take.begin(cutter.cut(pictures), near) >= least_fit(len(self._cameras)):
             self._cutter = cutter
 
     def _begin_in_pictures(self, pictures: Pictures) -> None:

@@ -7,13 +7,12 @@ import pytest
 
 from jawusd.base.errors import TrackingError
 from jawusd.geometry import Camera, make_transform, so3_exp
-from jawusd.pipeline.picture_search import LEAST_FIT, PictureSearch, orientations
+from jawusd.pipeline.picture_search import PictureSearch, least_fit, orientations
 from jawusd.pipeline.state import no_progress
 from jawusd.segmentation.rows import Rows
 
 TAKE = range(10, 2410)  # ten parts
-UPRIGHT = {}
-APART = Rows(np.zeros((2, 4, 4), np.uint8), 0.05)
+LEAST_FIT = least_fit(2)
 
 
 def camera(name, yaw_deg, quarters=0):
@@ -42,15 +41,17 @@ class _Footage:
 
 @pytest.fixture
 def searched(monkeypatch):
-    """Search with a given fit per frame; return the outcome and the frames tried."""
+    """Search with a given fit per frame; return the outcome and the frames tried.
 
-    def rows(picture, turns):
-        return APART if UPRIGHT["turns"] in (turns, None) else None
+    `seen` returns how many pixels of each arch are visible in a frame.
+    """
 
-    monkeypatch.setattr("jawusd.segmentation.rows.tooth_rows", rows)
+    def run(fit_of, upright=0, progress=no_progress, seen=lambda frame: (0, 0), cameras=tuple(CAMERAS)):
+        def rows(picture, turns):
+            masks = np.where(np.arange(16).reshape(4, 4) < np.reshape(seen(int(picture)), (2, 1, 1)), 255, 0)
+            return Rows(masks.astype(np.uint8), 0.05) if upright in (turns, None) else None
 
-    def run(fit_of, upright=0, progress=no_progress):
-        UPRIGHT["turns"] = upright
+        monkeypatch.setattr("jawusd.segmentation.rows.tooth_rows", rows)
         footage, tried, fits = _Footage(), [], []
 
         def near(sources, cameras, offsets, frame):
@@ -58,9 +59,10 @@ def searched(monkeypatch):
             fits.append(fit_of(frame))
             return None if fits[-1] is None else "pose"
 
-        rows = SimpleNamespace(at=near)
+        near_rows = SimpleNamespace(at=near)
         offsets = dict.fromkeys(CAMERAS, 0)
-        search = PictureSearch(footage, CAMERAS, offsets, rows, lambda frame, pose: (pose, fits[-1]))
+        used = {name: CAMERAS[name] for name in cameras}
+        search = PictureSearch(footage, used, offsets, near_rows, lambda frame, pose: (pose, fits[-1]))
         try:
             return search.run(TAKE, progress), tried, footage
         except TrackingError as error:
@@ -71,8 +73,8 @@ def searched(monkeypatch):
 
 def test_a_long_take_without_teeth_ends_and_says_what_was_tried(searched):
     words, tried, footage = searched(lambda frame: None)
-    assert len(tried) == 40 and max(footage.looked_at) < 10 + 10 * 240
-    assert "not found in 40 frames with a visible gap between the arches (10, 18," in words
+    assert len(tried) == 30 and max(footage.looked_at) < 10 + 10 * 240
+    assert "not found in 30 frames with a visible gap between the arches (10, 18," in words
 
 
 def test_the_best_poor_fit_is_told(searched):
@@ -89,7 +91,7 @@ def test_frames_looked_at_and_starts_tried_are_reported(searched):
     steps = []
     _, tried, _ = searched(lambda frame: 0.9 if frame == 26 else None, progress=lambda *step: steps.append(step))
     assert steps[:2] == [("search", 1, 30), ("search", 2, 30)]
-    assert [step for step in steps if step[0] == "try starts"] == [("try starts", k, 4) for k in (1, 2, 3)]
+    assert [step for step in steps if step[0] == "try starts"] == [("try starts", k, 3) for k in (1, 2, 3)]
     assert tried == [10, 18, 26]
 
 
@@ -101,9 +103,24 @@ def test_teeth_are_found_by_cameras_that_are_turned(searched, upright):
 
 def test_an_unclear_fit_is_compared_with_the_other_orientations(searched):
     """Arches that hang upside down in the images may fit a little."""
-    fits = iter([LEAST_FIT + 0.01] * 4 + [LEAST_FIT + 0.05] + [0.01] * 2)
+    fits = iter([LEAST_FIT + 0.01] * 4 + [LEAST_FIT + 0.05] + [0.01] * 7)
     begin, tried, _ = searched(lambda frame: next(fits), upright=None)
-    assert begin.fit == LEAST_FIT + 0.05 and len(tried) == 7
+    assert begin.fit == LEAST_FIT + 0.05 and len(tried) == 12
+
+
+def test_frames_that_show_most_of_both_arches_are_tried_first(searched):
+    """In frame 50, only the upper arch is large."""
+    large = {34: (2, 3), 42: (2, 2), 50: (4, 0)}
+    _, tried, _ = searched(lambda frame: 0.01, seen=lambda frame: large.get(frame, (1, 1)))
+    assert tried[:3] == [34, 42, 10]
+
+
+def test_one_camera_needs_a_better_fit(searched):
+    fit = least_fit(1) - 0.01
+    assert fit > LEAST_FIT
+    assert searched(lambda frame: fit)[0].fit == fit
+    words, _, _ = searched(lambda frame: fit, cameras=["cam0"])
+    assert f"at best {fit:.0%} of the visible contour fits; at least {least_fit(1):.0%} is needed" in words
 
 
 @pytest.mark.parametrize("quarters", [(0, 0, 0), (1, 0, 0), (0, 2, 0), (0, 0, 3), (1, 1, 1), (2, 2, 2), (3, 1, 0)])
