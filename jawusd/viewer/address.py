@@ -49,7 +49,9 @@ class FirstPage:
     def release(self) -> int:
         """Answer what has connected, stop listening, and return the port for viser."""
         self._server.shutdown()
-        while select.select([self._server], [], [], 0)[0]:  # closing resets connections that are not yet accepted
+        for _ in range(self._server.request_queue_size):  # closing resets connections that are not yet accepted
+            if not select.select([self._server], [], [], 0)[0]:
+                break
             self._server.handle_request()
         self._server.server_close()
         return self.port
@@ -64,6 +66,7 @@ class _Server(socketserver.ThreadingTCPServer):
 
     daemon_threads = True
     allow_reuse_address = os.name == "posix"  # on Windows, another program could then take the port
+    request_queue_size = 128  # number of connections that wait to be accepted
     answer = b""
 
     def __init__(self, family: socket.AddressFamily, address: tuple[str, int]) -> None:

@@ -192,14 +192,16 @@ def report(outcomes: list[Outcome]) -> None:
     for count in sorted({o.cameras for o in outcomes} - {0}):
         own = [o for o in outcomes if o.cameras == count]
         good = [o for o in own if not o.refused]
-        if not good:
+        seen = [o for o in good if o.known]
+        if not seen:
+            print(f"{count:7d}{len(own):8d}     0.0%   (starts: {len(good)})")
             continue
-        error, z2 = np.array([o.error_mm for o in good]), np.array([o.z2 for o in good])
-        frames, known = np.array([o.frames for o in good]), np.array([o.known for o in good])
-        silent = (np.array([o.silent for o in good]) * known * frames).sum() / max((known * frames).sum(), 1.0)
-        cells = [f"{len(own):8d}{100 * known.mean():7.1f}%{np.nanmean(error):8.3f}{np.nanmedian(error):8.3f}"]
-        cells += [f"{np.nanpercentile(error, 90):8.3f}{np.nanmax([o.worst_mm for o in good]):8.2f}{100 * silent:7.2f}%"]
-        cells += [f"{np.nanmedian(z2):8.2f}{np.nanmean(z2):8.2f}{np.nanmedian([o.sigma_mm for o in good]):8.3f}"]
+        error, z2 = np.array([o.error_mm for o in seen]), np.array([o.z2 for o in seen])
+        weight, known = np.array([o.frames * o.known for o in seen]), np.mean([o.known for o in good])
+        silent = np.average([o.silent for o in seen], weights=weight)
+        cells = [f"{len(own):8d}{100 * known:7.1f}%{error.mean():8.3f}{np.median(error):8.3f}"]
+        cells += [f"{np.percentile(error, 90):8.3f}{max(o.worst_mm for o in seen):8.2f}{100 * silent:7.2f}%"]
+        cells += [f"{np.median(z2):8.2f}{z2.mean():8.2f}{np.median([o.sigma_mm for o in seen]):8.3f}"]
         cells += [f"{len(good):8d}{np.nanmedian([o.core_s for o in good]):8.3f}"]
         print(f"{count:7d}" + "".join(cells))
 
