@@ -102,7 +102,8 @@ def test_teeth_are_found_in_the_pictures_of_one_camera_without_picks(rig):
     errors = tip_errors_mm(jawusd.load(rig), found.frames, found.d)
     assert found.camera_names == ("cam0",) and found.notes["start"]["by"] == "search"
     # The directions in which the take is followed may disagree on a frame in which the teeth close.
-    assert (found.state == SolveState.SOLVED).sum() >= 23
+    solved = found.state == SolveState.SOLVED
+    assert solved[:10].all() and solved.sum() >= 23  # the teeth close from then on
     assert errors.mean() < 1.0 and errors.max() < 4 * found.sigma_d.max()
 
 

@@ -13,6 +13,7 @@ from jawusd.formats.tracks import LOST
 from jawusd.geometry import se3_exp, transform_points
 from jawusd.pipeline import cameras as opening
 from jawusd.pipeline.cameras import open_footage
+from jawusd.pipeline.picture_search import _Candidate
 from jawusd.pipeline.state import no_progress
 from jawusd.pipeline.subject import load_meshes
 from jawusd.pipeline.track import first_pass, track_summary
@@ -177,7 +178,9 @@ def test_teeth_that_stay_lost_are_searched_and_followed_both_ways(offsets, truth
 
     monkeypatch.setattr(RegionTracker, "follow", lost)
     first = load_capture(EXAMPLE).bootstrap.frame
+    # The search begins in the middle, so that there are frames on both sides.
+    monkeypatch.setattr(_Candidate, "rank", property(lambda candidate: abs(candidate.frame - first - 4)))
     tracks = first_pass(unmasked((first, first + 9)), offsets, 2, no_progress)
-    # Both ways from the start; away from what the search found, and from there again with the colours of the start.
-    assert len(calls) >= 4 and not (tracks.status == LOST).any()
+    # Both ways from the start and from what the search found, and from there again with the colours of the start.
+    assert len(calls) == 6 and not (tracks.status == LOST).any()
     assert off_mm(tracks, truth).max() < 0.3
