@@ -1,4 +1,4 @@
-"""Solve shots of many synthetic subjects: python tests/benchmarks/solve_population.py --persons 10 [--near] [--spoilt].
+"""Solve shots of many synthetic subjects: python tests/benchmarks/solve_population.py --persons 10.
 
 The rig of each subject is built from a calibration take by three cameras; one annotator draws its masks. Each shot has
 other cameras, another motion and another annotator (see `draw_shot`). It is solved with one, two and three cameras; the
@@ -16,6 +16,8 @@ the program prints:
 
 With --spoilt, every fourth frame has a wrong mask of one arch in one of the first two cameras: eroded by 1 mm, moved by
 3 mm, or that of a distant frame. All figures but `core` then refer to these frames.
+
+With --head fixed, the cameras are head-mounted: the head does not move in the same shots, and is solved as constant.
 """
 
 from __future__ import annotations
@@ -88,6 +90,7 @@ class Task:
     near: bool  # whether to start near the truth, without a search
     counts: tuple[int, ...]  # numbers of cameras
     spoilt: bool = False  # whether single masks are wrong
+    fixed_head: bool = False  # whether the cameras are head-mounted
 
 
 def person(task: Task) -> list[Outcome]:
@@ -106,9 +109,9 @@ def person(task: Task) -> list[Outcome]:
     loaded = load_model(model)
     jaw, out = JawRig(loaded.arrays, loaded.meta), []
     for draw in task.draws:
-        shot = home / f"shot_{draw}_{task.frames[1]}{'_spoilt' * task.spoilt}"
+        shot = home / f"shot_{draw}_{task.frames[1]}{'_fixed' * task.fixed_head}{'_spoilt' * task.spoilt}"
         if not (shot / ("spoilt.npy" if task.spoilt else "capture.toml")).exists():  # written last
-            write_capture(shot, draw_shot(drawn, draw, task.frames[1]))
+            write_capture(shot, draw_shot(drawn, draw, task.frames[1], fixed_head=task.fixed_head))
             if task.spoilt:
                 spoil(shot, 2, np.random.default_rng([task.seed, draw]))
         for count in task.counts:
@@ -125,7 +128,7 @@ def solved(task: Task, draw: int, folder: Path, jaw: JawRig, count: int) -> Outc
     with np.load(folder / "truth" / "truth.npz", allow_pickle=False) as archive:
         truth = {name: archive[name] for name in archive.files}
     try:
-        found, outcome.core_s = (near_truth if task.near else searched)(capture, jaw, truth)
+        found, outcome.core_s = (near_truth if task.near else searched)(capture, jaw, truth, task.fixed_head)
     except TrackingError as error:
         outcome.refused = str(error)
         return outcome
@@ -150,7 +153,9 @@ def judge(outcome: Outcome, found: Performance, jaw: JawRig, relative: np.ndarra
         outcome.sigma_mm = float(np.median(sigma[known]))
 
 
-def searched(capture: Capture, jaw: JawRig, truth: dict[str, np.ndarray]) -> tuple[Performance, float]:
+def searched(
+    capture: Capture, jaw: JawRig, truth: dict[str, np.ndarray], fixed_head: bool
+) -> tuple[Performance, float]:
     """Solve as `jawusd solve` does; also return the processor time per frame and camera [s]."""
     meshes, marks = load_meshes(capture), []
     found = solve_capture(
@@ -160,13 +165,16 @@ def searched(capture: Capture, jaw: JawRig, truth: dict[str, np.ndarray]) -> tup
         meshes["upper_teeth"],
         meshes["lower_teeth"],
         jaw,
+        fixed_head=fixed_head,
         threads=1,
         progress=lambda done, total: marks.append(time.process_time()),
     )
     return found, (time.process_time() - marks[0]) / len(found.frames) / len(capture.cameras)
 
 
-def near_truth(capture: Capture, jaw: JawRig, truth: dict[str, np.ndarray]) -> tuple[Performance, float]:
+def near_truth(
+    capture: Capture, jaw: JawRig, truth: dict[str, np.ndarray], fixed_head: bool
+) -> tuple[Performance, float]:
     """Solve from a start near the truth, without a search."""
     table, meshes = {camera.name: camera for camera in load_cameras(capture)}, load_meshes(capture)
     scans = tuple(prepare_scan(meshes[f"{row}_teeth"], row) for row in ("upper", "lower"))
@@ -177,7 +185,7 @@ def near_truth(capture: Capture, jaw: JawRig, truth: dict[str, np.ndarray]) -> t
     first, config = int(truth["frames"][0]), TrackingConfig()
     centre = teeth_centre(scans, coordinates.arches(start))
     with MaskViews(capture.cameras, table, offsets, centre, config.working_px_per_mm, 1) as views:
-        shot = Shot(views, names, capture.frames, first, start, capture.fps)
+        shot = Shot(views, names, capture.frames, first, start, capture.fps, fixed_head=fixed_head)
         found = solve_performance(jaw, scans, shot, config)
     return found, (time.process_time() - begin) / len(found.frames) / len(names)
 
@@ -216,6 +224,7 @@ def main() -> None:
     parser.add_argument("--cameras", type=int, nargs="+", default=(1, 2, 3), help="numbers of cameras to solve with")
     parser.add_argument("--near", action="store_true", help="start near the truth, without a search")
     parser.add_argument("--spoilt", action="store_true", help="spoil single masks; with --cameras 2 3")
+    parser.add_argument("--head", choices=("free", "fixed"), default="free", help="fixed: head-mounted cameras")
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--out", type=Path, help="file to append outcomes to (JSON lines)")
     parser.add_argument("--captures", type=Path, help="folder to keep captures and rigs in, and to reuse them from")
@@ -223,7 +232,7 @@ def main() -> None:
     with contextlib.ExitStack() as stack:
         folder = options.captures or Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="jawusd_shots_")))
         rest = (tuple(range(options.draws)), tuple(options.frames), folder, options.near, tuple(options.cameras))
-        rest += (options.spoilt,)
+        rest += (options.spoilt, options.head == "fixed")
         outcomes: list[Outcome] = []
         pool = stack.enter_context(ProcessPoolExecutor(options.jobs))
         tasks = [Task(seed, *rest) for seed in range(options.seed, options.seed + options.persons)]

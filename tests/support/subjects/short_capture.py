@@ -117,13 +117,17 @@ def draw_capture(config: ShortConfig) -> ShortCapture:
     )
 
 
-def draw_shot(capture: ShortCapture, draw: int, frames: int) -> ShortCapture:
-    """Draw another take of the person and the scans of a capture, with other cameras, motion and annotator."""
+def draw_shot(capture: ShortCapture, draw: int, frames: int, *, fixed_head: bool = False) -> ShortCapture:
+    """Draw another take of the person and the scans of a capture, with other cameras, motion and annotator.
+
+    With a fixed head, the head does not move relative to the cameras; everything else is the same.
+    """
     own = int(np.random.SeedSequence([capture.config.seed, 0x5407, draw]).generate_state(1)[0])
     config = replace(capture.config, seed=own, frames=frames, without_picks=1.0)
     rng = np.random.default_rng([own, 0x5C09])
     cameras, T_world_bite = draw_cameras(rng, config.cameras, config.size_px)
     count = len(cameras)
+    motion = draw_motion(capture.motion.joint, capture.bite, T_world_bite, frames, rng)
     return replace(
         capture,
         config=config,
@@ -131,7 +135,7 @@ def draw_shot(capture: ShortCapture, draw: int, frames: int) -> ShortCapture:
         cameras=cameras,
         offsets=[0] * count,
         delays=np.zeros(count),
-        motion=draw_motion(capture.motion.joint, capture.bite, T_world_bite, frames, rng),
+        motion=replace(motion, head_rate=0.0) if fixed_head else motion,
     )
 
 
