@@ -131,6 +131,17 @@ def test_one_camera_starts_right_from_a_jaw_too_far_in_front(rig, monkeypatch, c
     assert error_mm < 1.0 if corrected else error_mm > 2.0
 
 
+@pytest.mark.slow
+def test_frames_are_aligned_again_from_smoothed_poses_whatever_was_predicted(rig):
+    tracker, (first, second), (near, wanted) = tracker_of_one_camera(rig, 60)
+    fit = tracker.begin(first, near)
+    tracker.carry(fit.pose.d + [-3.0, 0.0, 9.0], np.full(3, 0.01))
+    again = tracker.again(second, replace(fit, pose=replace(wanted, d=wanted.d + [0.0, 0.0, 1.0])))
+    assert again.found.all() and np.abs(again.pose.d - wanted.d).max() < 0.7
+    lost = replace(fit, pose=replace(wanted, d=wanted.d + [-15.0, 0.0, 0.0]), use=np.zeros_like(fit.use))
+    assert not tracker.again(second, lost).found.all()
+
+
 def tracker_of_one_camera(rig, frame):
     """Return a tracker of the example's first camera, and images and true poses of a frame and the next one."""
     jaw, shot = jawusd.load(rig), bare(0, 1, ["cam0"], picks=False)

@@ -23,9 +23,10 @@ from jawusd.tracking.contour.scan import prepare_scan, teeth_centre
 from jawusd.tracking.contour.solver import ContourSolver
 from jawusd.tracking.contour.views import MaskViews, masked_sources
 from jawusd.tracking.initialization.footage import Footage
+from jawusd.tracking.performance import smoother
 from jawusd.tracking.performance.attempts import FrameFit
-from jawusd.tracking.performance.coordinates import LOCAL, Coordinates, Pose
-from jawusd.tracking.performance.instant import Equations, Expected, InstantSolver
+from jawusd.tracking.performance.coordinates import JAW, LOCAL, Coordinates, Pose
+from jawusd.tracking.performance.instant import Equations, Expected, InstantSolver, bound_equations
 from jawusd.tracking.performance.shot import Shot, solve_performance
 from jawusd.tracking.performance.single_start import SingleStart
 from jawusd.tracking.performance.smoother import Smoother
@@ -231,6 +232,28 @@ def test_the_bound_pulls_a_jaw_inside_but_makes_it_no_surer(jaw, scans, truth, c
     inside, beyond = smoothed(truth[0][0]), smoothed(away)
     assert jaw.margin(away) < -1 < -0.1 < jaw.margin(beyond.fits[0].pose.d) < 0
     np.testing.assert_allclose(beyond.covariance[:, 6:, 6:], inside.covariance[:, 6:, 6:], rtol=1e-6)
+
+
+@pytest.mark.parametrize("bounds", [1, 5])
+def test_smoothing_does_not_close_the_jaw_farther_than_the_teeth(jaw, scans, truth, monkeypatch, bounds):
+    """The outlines ask for a step from a jaw that is slightly open to one that is closed by 1.5 mm too far."""
+    monkeypatch.setattr(smoother, "_BOUND_ROUNDS", bounds)
+    instants = InstantSolver(ContourSolver(scans, TrackingConfig()), Coordinates(jaw, scans))
+    closed_mm, asked = instants.coordinates.closed_mm, np.r_[np.zeros(6), -2.0, 0.0, 0.0]
+    d = np.array([closed_mm + 0.5, 0.0, 0.5])
+
+    def system(fits, state, weight, motion, slow, bound_at):
+        matrix, right = bound_equations(instants.coordinates, fits[0].pose.d, bound_at[0])
+        step = np.linalg.solve(np.eye(9) + matrix, asked + right)
+        return SimpleNamespace(solve=lambda: (step[None], np.zeros(0)))
+
+    smoothing = Smoother(instants, None, range(1), 25.0, 1)
+    monkeypatch.setattr(smoothing, "_system", system)
+    none = np.zeros((2, 1), bool)
+    fits = [FrameFit(Pose(truth[1][0], d), None, none, none, np.full(none.shape, np.nan))]
+    step, _ = smoothing._step(fits, None, None, None, None)
+    below_mm = closed_mm - (d + step[0, JAW])[0]
+    assert below_mm == pytest.approx(0.0 if bounds > 1 else 1.5, abs=0.05)
 
 
 @pytest.mark.parametrize(("judged_mm", "step_mm", "again"), [(0.0, 0.2, True), (0.3, 0.2, False), (0.3, 0.4, True)])

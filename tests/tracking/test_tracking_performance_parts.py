@@ -111,7 +111,7 @@ def inside_by(bias_px, jaw, frames, annotator):
             habit_distance=(moved @ free)[:, None],
         )
         fit = SimpleNamespace(pose=pose, solution=SimpleNamespace(outline=outline), found=np.ones(2, bool), growth=None)
-        system.add_frame(k, *unknowns.frame(fit, np.full(2, 1.0 / 10.0)))
+        system.add_frame(k, *unknowns.frame(fit, np.full(2, 1.0 / 10.0), fit.pose.d))
     system.add_shared(*unknowns.prior(none))
     return unknowns.moved([pose] * frames, none, *system.solve())[1].habits[:, 0, 0]
 
@@ -252,6 +252,22 @@ def test_teeth_cannot_close_below_the_smallest_captured_opening(jaw):
     step = np.linalg.solve(matrix[JAW, JAW] + 1e-6 * np.eye(3), right[JAW])
     assert step[0] == pytest.approx(1.0, abs=0.05) and matrix[OPENING, OPENING] > CLOSED_MM**-2.0
     assert not matrix[HEAD].any()
+
+
+def test_the_bound_can_be_linearised_where_a_step_ends(jaw):
+    scan = SimpleNamespace(centre=np.array([0.0, 4.0, -9.0]))
+    coordinates = Coordinates(jaw, (scan, scan))
+    d, closed = np.array([coordinates.closed_mm + 2.0, 0.0, 0.5]), np.array([coordinates.closed_mm - 1.0, 0.0, 0.5])
+    assert not bound_equations(coordinates, d)[0].any()
+    matrix, right = bound_equations(coordinates, d, at=closed)
+    step = np.linalg.solve(matrix[JAW, JAW] + 1e-6 * np.eye(3), right[JAW])
+    assert step[0] == pytest.approx(-2.0, abs=0.05)
+    outside = np.array([8.0, 30.0, 0.5])
+    margin, gradient = jaw.margin(outside), jaw.margin_gradient(outside)
+    near = outside - 2.0 * gradient
+    matrix, right = bound_equations(coordinates, near, at=outside)
+    step = gradient * (right[JAW] @ gradient) / (gradient @ matrix[JAW, JAW] @ gradient)
+    assert margin + gradient @ (near + step - outside) == pytest.approx(0.0, abs=1e-9)
 
 
 def test_deviations_of_d_include_the_error_of_the_rig(jaw, performance):

@@ -139,22 +139,26 @@ class InstantSolver:
         return turn + float(np.linalg.norm(step[HEAD][3:])) + float(np.linalg.norm(step[JAW]))
 
 
-def bound_equations(coordinates: Coordinates, d: Array) -> tuple[Array, Array]:
+def bound_equations(coordinates: Coordinates, d: Array, at: Array | None = None) -> tuple[Array, Array]:
     """Return normal matrix (9, 9) and right-hand side (9,) of the penalties on poses outside the bound or overclosed.
 
     Outlines of closed teeth fit nearly as well with the lower teeth some millimetres higher, inside the upper teeth.
+
+    Args:
+        d: jaw parameters before the step, shape (3,).
+        at: jaw parameters at which the penalties, which are zero inside the bound, are linearised; default: `d`.
     """
     matrix, right = np.zeros((LOCAL, LOCAL)), np.zeros(LOCAL)
-    margin = float(coordinates.jaw.margin(d))
+    at = d if at is None else at
+    margin = float(coordinates.jaw.margin(at))
     if margin < 0:
-        gradient = coordinates.jaw.margin_gradient(d)
+        gradient = coordinates.jaw.margin_gradient(at)
         weight = min(1.0, _BOUND_LINEAR_MM / -margin) / _BOUND_MM**2  # Huber's weight
         matrix[JAW, JAW] = weight * np.outer(gradient, gradient)
-        right[JAW] = -weight * gradient * margin
-    below_mm = coordinates.closed_mm - float(d[0])
-    if below_mm > 0:
+        right[JAW] = -weight * gradient * (margin + gradient @ (d - at))
+    if at[0] < coordinates.closed_mm:
         matrix[OPENING, OPENING] += CLOSED_MM**-2.0
-        right[OPENING] += below_mm / CLOSED_MM**2
+        right[OPENING] += (coordinates.closed_mm - float(d[0])) / CLOSED_MM**2
     return matrix, right
 
 

@@ -67,6 +67,10 @@ class Prediction:
         pose = self._coordinates.moved(self.last, reach * self._velocity)
         return Expected(pose, np.minimum(np.sqrt(variance), LARGEST_SIGMA) ** -2.0)
 
+    def around(self, pose: Pose) -> Expected:
+        """Return a prior around a pose of the frame from another source."""
+        return Expected(pose, self._miss**-2.0)
+
     def take(self, pose: Pose, found: Mask) -> None:
         """Update with the pose of the next frame; `found` is whether each arch was found in it, shape (2,)."""
         moved = self._coordinates.step(self.last, pose) / self._frames

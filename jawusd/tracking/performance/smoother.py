@@ -27,6 +27,9 @@ from jawusd.tracking.performance.views import Views, growth_of
 _ROUNDS = 2
 # number of rounds if focal lengths are unknown, since they are strongly coupled with the distance of the head
 _FOCAL_ROUNDS = 6
+# Maximum number of solutions of the linearised equations, each with the bound linearised at the previous one; change of
+# d below which no further one is computed [mm].
+_BOUND_ROUNDS, _SAME_MM = 5, 0.05
 #: Ratio of true to computed variance of a frame's unknowns [-]: the equations ignore that outline errors persist over
 #: frames.
 WIDER = 1.5**2
@@ -116,7 +119,7 @@ class Smoother:
         if self._unknowns.free_focal and self._views is not None:
             fits = [self._matched(fit, frame, state) for fit, frame in zip(fits, self._frames, strict=True)]
         for round_ in range(self._rounds + 1):
-            local, shared = self._system(fits, state, weight, motion, slow).solve()
+            local, shared = self._step(fits, state, weight, motion, slow)
             own, more = np.split(local, [self._unknowns.local], axis=1)
             poses, state = self._unknowns.moved([fit.pose for fit in fits], state, own, shared)
             slow = slow + more if self._skin is not None else slow
@@ -131,7 +134,7 @@ class Smoother:
             weight = 1.0 / outline_variance(fits, config, self._length_px)
         sigma = np.zeros(self._cameras)
         # The bound of the rig is omitted: it is an inequality, and would make the covariance too small.
-        covariance, shared = self._covariance(self._system(fits, state, weight, motion, slow, bounded=False))
+        covariance, shared = self._covariance(self._system(fits, state, weight, motion, slow, None))
         if self._unknowns.free_focal:
             sigma = np.sqrt(self._wider * np.diag(shared)[self._unknowns.focal])
         gains = np.stack([self._rig_gain(fit, weight) for fit in fits])
@@ -155,6 +158,22 @@ class Smoother:
     def _by_skin(self, count: int) -> Mask:
         return np.zeros(count, bool) if self._skin is None else self._skin.used
 
+    def _step(
+        self, fits: Sequence[FrameFit], state: TakeState, weight: Array, motion: Motion, slow: Array
+    ) -> tuple[Array, Array]:
+        """Return the step of all unknowns, shapes (F, L) and (G,), that is most likely for the outlines as matched.
+
+        The bound only acts on poses outside it, so it is linearised at the poses after the step.
+        """
+        d = np.stack([fit.pose.d for fit in fits])
+        bound_at = d
+        for _ in range(_BOUND_ROUNDS):
+            local, shared = self._system(fits, state, weight, motion, slow, bound_at).solve()
+            before, bound_at = bound_at, d + local[:, self._unknowns.jaw]
+            if np.abs(bound_at - before).max() < _SAME_MM:
+                break
+        return local, shared
+
     def _system(
         self,
         fits: Sequence[FrameFit],
@@ -162,10 +181,13 @@ class Smoother:
         weight: Array,
         motion: Motion,
         slow: Array,
-        *,
-        bounded: bool = True,
+        bound_at: Array | None,
     ) -> TakeSystem:
-        """Linearise the equations of the take at its current state, with or without the bound of the rig."""
+        """Linearise the equations of the take at its current state.
+
+        Args:
+            bound_at: jaw parameters at which the bound of the rig is linearised, shape (F, 3); None to omit it.
+        """
         unknowns = self._unknowns
         more = 0 if self._skin is None else SLOW
         system = TakeSystem(len(fits), unknowns.local + more, unknowns.shared)
@@ -174,7 +196,7 @@ class Smoother:
         if unknowns.head is not None:
             weak[unknowns.head] = LARGEST_SIGMA[HEAD] ** -2.0
         for k, fit in enumerate(fits):
-            precision, right = unknowns.frame(fit, weight, bounded=bounded)
+            precision, right = unknowns.frame(fit, weight, None if bound_at is None else bound_at[k])
             # The weak prior regularises unknowns without measurements.
             precision, right = _with_more(precision + np.diag(1e-3 * weak), right, unknowns.local, more)
             system.add_frame(k, precision, right)

@@ -85,20 +85,20 @@ class Unknowns:
         off[self.focal] = state.log_focal if self.free_focal else ()
         return precision, -precision * off
 
-    def frame(self, fit: FrameFit, weight: Array, *, bounded: bool = True) -> tuple[Array, Array]:
+    def frame(self, fit: FrameFit, weight: Array, bound_at: Array | None) -> tuple[Array, Array]:
         """Return the normal matrix (L + G, L + G) and right-hand side (L + G,) of a frame, from outlines and bound.
 
         Args:
             fit: fit of the frame, with outlines matched at its pose.
             weight: 1 / (outline variance times correlation length) of both arches [1/px^3], shape (2,).
-            bounded: whether to include the bound of the rig.
+            bound_at: jaw parameters at which the bound of the rig is linearised, shape (3,); None to omit it.
         """
         pose, solution, found = fit.pose, fit.solution, fit.found
         bias = slice(LOCAL, LOCAL + len(self._sigma))
         size = bias.stop + self.free_focal
         matrix, right = np.zeros((size, size)), np.zeros(size)
-        if bounded:
-            matrix[:LOCAL, :LOCAL], right[:LOCAL] = bound_equations(self._coordinates, pose.d)
+        if bound_at is not None:
+            matrix[:LOCAL, :LOCAL], right[:LOCAL] = bound_equations(self._coordinates, pose.d, bound_at)
         for r, slope in zip(ARCHES, self._coordinates.slopes(pose), strict=True):
             if solution is None or not found[r]:
                 continue

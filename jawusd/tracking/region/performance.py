@@ -17,7 +17,7 @@ from jawusd.tracking.contour.annotator import AnnotatorPrior
 from jawusd.tracking.contour.quality import score_px
 from jawusd.tracking.contour.scan import Scan, teeth_centre, thinned
 from jawusd.tracking.contour.solver import ContourSolver
-from jawusd.tracking.follow import Begin, TwoWays
+from jawusd.tracking.follow import Begin, TwoWays, both_ways
 from jawusd.tracking.performance.attempts import FrameFit
 from jawusd.tracking.performance.coordinates import Coordinates, Pose
 from jawusd.tracking.performance.instant import InstantSolver
@@ -48,6 +48,9 @@ _FIRST_FRAMES, _FOCAL_ROUNDS = 120, 3
 _BORDERS = AnnotatorPrior(common=(0.0, 0.0, 0.0), arch=(0.4, 0.08, 0.02), camera=(0.0, 0.0), frames=5.0)
 _CORRELATION_PX = 80.0
 _ALONE = 2.0  # factor on the variance for a single camera [-], since no other view reveals shifted borders
+# With one camera, poses of single frames are off by millimetres along the view, so that their contours are matched at
+# wrong distances. The number of rounds in which they are matched again at the smoothed poses of the take.
+_AGAIN_ALONE = 2
 _OFF_MM = 1.0  # possible error of an unconfirmed pose next to lost frames above which the pose is left out
 _CLEARLY = 1.05  # minimum ratio of matched contour for another pose to replace a trusted one
 
@@ -138,6 +141,9 @@ class PictureTake:
         head = KNOWN if shot.fixed_head else 1.0
         fits = self._follow(cameras, (frame, start), shot.frames, head, progress, recover=True)
         smoothed = self._smoothed(shot.frames, fits, jaw_of_skin(shot.skin, shot.frames, fits))
+        for _ in range(_AGAIN_ALONE if len(cameras) == 1 else 0):
+            fits = self._again(cameras, head, frame, smoothed.fits, progress)
+            smoothed = self._smoothed(shot.frames, fits, jaw_of_skin(shot.skin, shot.frames, fits))
         if shot.free_focal:
             log_focal = smoothed.state.log_focal + np.log(factors)
             smoothed = replace(smoothed, state=replace(smoothed.state, log_focal=log_focal))
@@ -166,14 +172,18 @@ class PictureTake:
 
     def _begin(self, cameras: Sequence[Camera], head: float, at: int, near: Pose) -> Begin[FrameFit]:
         """Return the fit of a frame near a guess, from which a take can be followed."""
-        colours = LearnedColours(self._scans, cameras, self._axes)
-        tracker = RigTracker(self._rough, colours, head=head, free_focal=self._shot.free_focal, whole=self._instants)
-        fit = tracker.begin(next(self._shot.cuts(cameras, self._centre(near), range(at, at + 1))), near)
+        tracker, fit = self._began(cameras, head, at, near)
 
         def follow(way: range, begin: FrameFit) -> Iterator[FrameFit]:
             return map(tracker.reversed_from(begin).step, self._shot.cuts(cameras, self._centre(begin.pose), way))
 
         return Begin(at, fit, follow)
+
+    def _began(self, cameras: Sequence[Camera], head: float, at: int, near: Pose) -> tuple[RigTracker, FrameFit]:
+        """Return a tracker that begins in a frame near a guess, and the fit of that frame."""
+        colours = LearnedColours(self._scans, cameras, self._axes)
+        tracker = RigTracker(self._rough, colours, head=head, free_focal=self._shot.free_focal, whole=self._instants)
+        return tracker, tracker.begin(next(self._shot.cuts(cameras, self._centre(near), range(at, at + 1))), near)
 
     def _centre(self, pose: Pose) -> Array:
         return teeth_centre(self._scans, self.coordinates.arches(pose))
@@ -206,6 +216,21 @@ class PictureTake:
                 if least_mm > _OFF_MM:
                     take.known[frame] = replace(take.known[frame], use=np.zeros_like(take.known[frame].use))
         return [take.known[frame] for frame in frames]
+
+    def _again(
+        self, cameras: Sequence[Camera], head: float, start: int, fits: Sequence[FrameFit], progress: Progress
+    ) -> list[FrameFit]:
+        """Return the fits of all frames, aligned once more from the poses of smoothed fits."""
+        shot = self._shot
+        smoothed, found = dict(zip(shot.frames, fits, strict=True)), dict[int, FrameFit]()
+        tracker, begin = self._began(cameras, head, start, smoothed[start].pose)
+        for way in both_ways(start, shot.frames):
+            same = tracker.reversed_from(begin)
+            frames = range(start, way.stop, way.step)
+            for frame, cut in zip(frames, self._shot.cuts(cameras, self._centre(begin.pose), frames), strict=True):
+                found[frame] = same.again(cut, smoothed[frame])
+                progress(len(found), len(fits))
+        return [found[frame] for frame in shot.frames]
 
     def _places(self, fit: FrameFit) -> Array:
         return transform_points(self._jaw.pose(fit.pose.d), self._scans[1].probes)

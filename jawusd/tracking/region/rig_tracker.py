@@ -132,10 +132,33 @@ class RigTracker:
         least = np.where(unsure, AGAIN, _LOST) * usual
         rough, look = self._best(expected, look, cut, frames, least)
         rough, found = self._with_habitual_starts(expected, look, rough, look.polished(rough))
+        return self._judged(look, rough, found, least, expected.pose)
+
+    def again(self, cut: Cut, fit: FrameFit) -> FrameFit:
+        """Align the images of a frame once more from a pose that is better than the prediction, without a search.
+
+        Args:
+            fit: the pose; if an arch was not found in it, both arches must fit as well as after a loss.
+        """
+        look = self._look(cut, self._coordinates.arches(fit.pose))
+        if not look.use.any():
+            return fit
+        rough = look.align(fit.pose, self._motion.around(fit.pose), self._effort.gates_px)
+        least = np.where(fit.found.all(), _LOST, AGAIN) * self._usual_share()
+        return self._judged(look, rough, look.polished(rough), least, fit.pose)
+
+    def _judged(self, look: _InstantImages, rough: Aligned, found: Aligned, least: Array, otherwise: Pose) -> FrameFit:
+        """Return the fit of a frame, and learn from it if it is good.
+
+        Args:
+            least: matched fraction of each arch above which it is found, shape (2,).
+            otherwise: the pose if neither arch is found.
+        """
+        usual = self._usual_share()
         share, fine = fitting_share(rough.solution), fitting_share(found.solution)
         trusted = (share >= least) & (matched_px(found.solution) >= self._least_px)
         if not trusted.any():
-            found = replace(found, pose=expected.pose)
+            found = replace(found, pose=otherwise)
         self._frame += 1
         if trusted.all():
             self._failed = 0
