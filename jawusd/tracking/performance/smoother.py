@@ -64,7 +64,6 @@ class Smoother:
         free_focal: bool = False,
         length_px: float | None = None,
         annotator: AnnotatorPrior | None = None,
-        wider: float = WIDER,
         skin: SkinJaw | None = None,
     ) -> None:
         """Configure the refinement.
@@ -80,10 +79,9 @@ class Smoother:
             free_focal: whether to estimate the focal lengths.
             length_px: correlation length of outline errors; default: estimated from the residuals.
             annotator: prior on annotator bias; default: of hand-drawn masks.
-            wider: ratio of the true to the computed variance of a frame's unknowns.
             skin: jaw parameters estimated from facial skin in every frame, if known.
         """
-        self._wider, self._skin = wider, None if skin is None else SkinFactor(skin, fps, wider)
+        self._skin = None if skin is None else SkinFactor(skin, fps, WIDER)
         self._cameras, self._rounds, self._length_px = cameras, _FOCAL_ROUNDS if free_focal else _ROUNDS, length_px
         if views is None:
             self._rounds = 0
@@ -136,7 +134,7 @@ class Smoother:
         # The bound of the rig is omitted: it is an inequality, and would make the covariance too small.
         covariance, shared = self._covariance(self._system(fits, state, weight, motion, slow, None))
         if self._unknowns.free_focal:
-            sigma = np.sqrt(self._wider * np.diag(shared)[self._unknowns.focal])
+            sigma = np.sqrt(WIDER * np.diag(shared)[self._unknowns.focal])
         gains = np.stack([self._rig_gain(fit, weight) for fit in fits])
         return Smoothed(fits, covariance, state, sigma, self._by_skin(len(fits)), gains)
 
@@ -252,14 +250,14 @@ class Smoother:
         wide = np.sqrt(unknowns.redundancy)
         shared = found.shared * np.outer(wide, wide)
         if not unknowns.fixed_head:
-            own = self._wider * found.own + found.response @ shared @ np.swapaxes(found.response, 1, 2)
+            own = WIDER * found.own + found.response @ shared @ np.swapaxes(found.response, 1, 2)
             return np.asarray(own, np.float64), found.shared
         # The head pose, which is constant over the take, is one of the take's unknowns.
         response = np.zeros((system.frames, LOCAL, unknowns.shared))
         response[:, HEAD, :6] = np.eye(6)
         response[:, JAW] = found.response
-        out = response @ (self._wider * shared) @ np.swapaxes(response, 1, 2)
-        out[:, JAW, JAW] += self._wider * found.own
+        out = response @ (WIDER * shared) @ np.swapaxes(response, 1, 2)
+        out[:, JAW, JAW] += WIDER * found.own
         return np.asarray(out, np.float64), found.shared
 
 

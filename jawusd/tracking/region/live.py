@@ -19,6 +19,7 @@ from jawusd.tracking.performance.attempts import FrameFit
 from jawusd.tracking.performance.coordinates import JAW, Coordinates, Pose
 from jawusd.tracking.performance.instant import InstantSolver, rig_gain
 from jawusd.tracking.performance.motion import STEADY
+from jawusd.tracking.performance.smoother import WIDER
 from jawusd.tracking.region.appearance import CORRELATION_PX, Cut, LearnedColours
 from jawusd.tracking.region.effort import FAST
 from jawusd.tracking.region.rig_tracker import RigTracker
@@ -27,7 +28,6 @@ from jawusd.tracking.region.search import fitting_share
 _FACES = 3_000
 # The settings are coarser than for recorded images, since dropped frames reduce accuracy more than coarse settings.
 _SETTINGS = replace(TrackingConfig(), sample_step_px=3.0, redraw_px=4.0, parallax_px=6.0, settled_mm=0.4, judged_mm=0.3)
-_WIDER = 1.5  # ratio of true to computed standard deviation of d, as in the smoother
 
 
 class LiveTake:
@@ -90,7 +90,7 @@ class LiveTake:
         """
         if self._tracker is None:
             raise ValueError("`carry` was called before `begin`")
-        self._tracker.carry(d, np.diag(covariance) / _WIDER**2)
+        self._tracker.carry(d, np.diag(covariance) / WIDER)
 
     def covariance_d(self, fit: FrameFit) -> Array:
         """Return the covariance of the jaw parameters d in the last step [mm^2], including the rig error (3, 3).
@@ -107,4 +107,4 @@ class LiveTake:
             precision = precision + outlines.matrix
             gain = rig_gain(self.coordinates, fit.pose, precision, outlines.misfit.precision)
             of_rig = gain @ self.coordinates.jaw.pose_covariance(fit.pose.d) @ gain.T
-        return np.asarray(_WIDER**2 * np.linalg.inv(precision)[JAW, JAW] + of_rig, np.float64)
+        return np.asarray(WIDER * np.linalg.inv(precision)[JAW, JAW] + of_rig, np.float64)

@@ -24,7 +24,7 @@ from jawusd.tracking.performance.instant import InstantSolver
 from jawusd.tracking.performance.motion import KNOWN, STEADY
 from jawusd.tracking.performance.results import performance_of
 from jawusd.tracking.performance.skin import SkinOf, jaw_of_skin
-from jawusd.tracking.performance.smoother import WIDER, Smoothed, Smoother, with_one_head
+from jawusd.tracking.performance.smoother import Smoothed, Smoother, with_one_head
 from jawusd.tracking.region.appearance import Cut, LearnedColours
 from jawusd.tracking.region.rig_tracker import RigTracker
 from jawusd.tracking.region.search import FACES, REDRAW_PX, SAMPLE_STEP_PX, fitting_share
@@ -47,7 +47,6 @@ _FIRST_FRAMES, _FOCAL_ROUNDS = 120, 3
 # learned while tracking.
 _BORDERS = AnnotatorPrior(common=(0.0, 0.0, 0.0), arch=(0.4, 0.08, 0.02), camera=(0.0, 0.0), frames=5.0)
 _CORRELATION_PX = 80.0
-_ALONE = 2.0  # factor on the variance for a single camera [-], since no other view reveals shifted borders
 # With one camera, poses of single frames are off by millimetres along the view, so that their contours are matched at
 # wrong distances. The number of rounds in which they are matched again at the smoothed poses of the take.
 _AGAIN_ALONE = 2
@@ -248,7 +247,6 @@ class PictureTake:
             free_focal=shot.free_focal,
             length_px=_CORRELATION_PX,
             annotator=_BORDERS,
-            wider=WIDER * (_ALONE if len(shot.cameras) == 1 else 1.0),
             skin=skin,
         )
         return smoother.run(fits)
