@@ -10,7 +10,7 @@ import pytest
 from package_copy import ROOT
 
 from jawusd.formats.capture import load_capture
-from jawusd.geometry import relative_pose
+from jawusd.geometry import make_transform, relative_pose
 from jawusd.pipeline.cameras import open_footage
 from jawusd.pipeline.segment_guide import known_guide, save_guide
 from jawusd.pipeline.subject import load_meshes, subject_of_capture
@@ -250,6 +250,31 @@ def test_what_a_search_finds_is_kept_only_if_enough_of_it_fits(monkeypatch, fits
     tracker._wide_look, tracker._searched = (lambda *_: look), (lambda *_: far)
     found, _ = tracker._best(SimpleNamespace(pose=None), look, None, 1.0, np.array([0.15, 0.15]))
     assert found.pose == kept
+
+
+@pytest.mark.parametrize(
+    ("d", "other_d", "score", "ambiguous"),
+    [
+        ([0.5, 0.0, 0.0], [0.5, 0.0, 2.0], 0.9, True),
+        ([0.5, 0.0, 0.0], [0.5, 0.0, 0.4], 0.9, False),  # the same pose
+        ([0.5, 0.0, 0.0], [0.5, 0.0, 2.0], 0.6, False),  # fits worse
+        ([5.0, 0.0, 0.0], [5.0, 0.0, 2.0], 0.9, False),  # open
+    ],
+)
+def test_nearly_closed_teeth_are_not_found_if_another_pose_fits(monkeypatch, d, other_d, score, ambiguous):
+    pose, other = (SimpleNamespace(d=np.array(values)) for values in (d, other_d))
+    found, trial = SimpleNamespace(pose=pose, score=1.0), SimpleNamespace(pose=other, score=score)
+    monkeypatch.setattr(rig_tracker, "_matched_score", lambda aligned: aligned.score)
+    tracker = RigTracker.__new__(RigTracker)
+    jaw = SimpleNamespace(pose=lambda d: make_transform(np.eye(3), np.array([d[1], -d[0], d[2]])))
+    tracker._coordinates = SimpleNamespace(jaw=jaw, arches=lambda pose: None)
+    tracker._instants = SimpleNamespace(solver=SimpleNamespace(scans=[None, SimpleNamespace(probes=np.eye(3))]))
+    look = SimpleNamespace(use=np.ones((2, 1), bool), align=lambda *_: found, polished=lambda aligned: aligned)
+    tracker._motion, tracker._effort = SimpleNamespace(around=lambda pose: None), THOROUGH
+    tracker._look, tracker._habitual = (lambda *_: look), (lambda *_: [trial])
+    tracker._usual_share, tracker._judged = (lambda: np.full(2, 0.4)), (lambda look, rough, found, least, pose: least)
+    least = tracker.again(None, SimpleNamespace(pose=pose, found=np.ones(2, bool)))
+    assert least[0] < 0.4 and np.isinf(least[1]) == ambiguous
 
 
 def test_a_jaw_out_of_sight_is_searched_although_the_head_fits_less_than_usual(monkeypatch):

@@ -3,30 +3,26 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterator
 from copy import copy
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from jawusd.base.arrays import Array, Mask
+from jawusd.base.arrays import Array
+from jawusd.geometry import transform_points
 from jawusd.tracking.contour.quality import matched_px, score_px
-from jawusd.tracking.contour.scan import CROWN
-from jawusd.tracking.contour.solver import Matched
-from jawusd.tracking.contour.views import present_masks
 from jawusd.tracking.initialization.first_frame import FIRST_ROUNDS
 from jawusd.tracking.performance.attempts import LARGEST_SIGMA, FrameFit
 from jawusd.tracking.performance.coordinates import JAW, Pose
 from jawusd.tracking.performance.instant import Aligned, Expected, InstantSolver
 from jawusd.tracking.performance.motion import Prediction
 from jawusd.tracking.performance.single_start import spread_out
-from jawusd.tracking.performance.views import growth_of
-from jawusd.tracking.region.appearance import FIRST_RATES, RATES, Cut, LearnedColours, Picture
+from jawusd.tracking.region.appearance import FIRST_RATES, RATES, Cut, LearnedColours
 from jawusd.tracking.region.effort import FAR_GATES_PX, THOROUGH, Effort
+from jawusd.tracking.region.instant_images import InstantImages
 from jawusd.tracking.region.search import (
     AGAIN,
-    BORDER_PX3,
-    LAST_GATES_PX,
     LEAST_USUAL,
     TRIAL_GATES_PX,
     USUAL_FRAMES,
@@ -47,6 +43,10 @@ _JAWS = 96  # number of jaw poses that a search ranks by colour
 # of 18 rendered subjects (`tests/benchmarks/looks.py`), aligned from true poses, 5 jaws were off by 2.5 to 6.7 mm; with
 # this choice, the largest error is 1.95 mm.
 _NEAR_MIDDLE, _CLEARER = 1.0 / 3.0, 1.2
+
+# With one camera, teeth that are nearly closed may match the image at several poses. Opening below which other poses
+# are aligned [mm], distance from which they differ [mm], and ratio of matched contour above which they fit as well.
+_CLOSED_MM, _APART_MM, _SIMILAR = 2.0, 1.0, 0.75
 
 
 class RigTracker:
@@ -106,7 +106,7 @@ class RigTracker:
         colours.begin(cut(arches), arches)
         for _ in range(FIRST_ROUNDS):
             arches = self._coordinates.arches(pose)
-            look = _InstantImages(self._instants, colours, cut(arches), arches, self._whole)
+            look = InstantImages(self._instants, colours, cut(arches), arches, self._whole)
             rough = look.align(pose, Expected(pose, sigma**-2.0), FAR_GATES_PX)
             found = look.polished(rough)
             pose = found.pose
@@ -143,11 +143,24 @@ class RigTracker:
         look = self._look(cut, self._coordinates.arches(fit.pose))
         if not look.use.any():
             return fit
-        rough = look.align(fit.pose, self._motion.around(fit.pose), self._effort.gates_px)
-        least = np.where(fit.found.all(), _LOST, AGAIN) * self._usual_share()
-        return self._judged(look, rough, look.polished(rough), least, fit.pose)
+        expected = self._motion.around(fit.pose)
+        rough = look.align(fit.pose, expected, self._effort.gates_px)
+        found, least = look.polished(rough), np.where(fit.found.all(), _LOST, AGAIN) * self._usual_share()
+        if found.pose.d[0] < _CLOSED_MM and self._is_ambiguous(expected, look, found):
+            least[1] = np.inf
+        return self._judged(look, rough, found, least, fit.pose)
 
-    def _judged(self, look: _InstantImages, rough: Aligned, found: Aligned, least: Array, otherwise: Pose) -> FrameFit:
+    def _is_ambiguous(self, expected: Expected, look: InstantImages, found: Aligned) -> bool:
+        """Return whether another jaw pose, aligned from a habitual one, fits nearly as well."""
+        points = self._instants.solver.scans[1].probes
+        place, score = transform_points(self._coordinates.jaw.pose(found.pose.d), points), _matched_score(found)
+        for trial in self._habitual(expected, look):
+            other = transform_points(self._coordinates.jaw.pose(trial.pose.d), points)
+            if np.linalg.norm(other - place, axis=1).mean() > _APART_MM and _matched_score(trial) > _SIMILAR * score:
+                return True
+        return False
+
+    def _judged(self, look: InstantImages, rough: Aligned, found: Aligned, least: Array, otherwise: Pose) -> FrameFit:
         """Return the fit of a frame, and learn from it if it is good.
 
         Args:
@@ -181,18 +194,18 @@ class RigTracker:
     def _usual_share(self) -> Array:
         return np.maximum(np.median(self._usual, axis=0), LEAST_USUAL * self._first)
 
-    def _look(self, cut: Cut, around: Array) -> _InstantImages:
+    def _look(self, cut: Cut, around: Array) -> InstantImages:
         """Return the images cropped around both arches at poses (2, 4, 4)."""
         before = self._coordinates.arches(self._motion.last)
-        return _InstantImages(self._instants, self._colours, cut(around), before, self._whole)
+        return InstantImages(self._instants, self._colours, cut(around), before, self._whole)
 
-    def _wide_look(self, found: Aligned, cut: Cut) -> _InstantImages:
+    def _wide_look(self, found: Aligned, cut: Cut) -> InstantImages:
         """Return the images cropped around the full range of the jaw for a head pose."""
         return self._look(cut, np.stack([found.pose.head, found.pose.head @ self._widest]))
 
     def _best(
-        self, expected: Expected, look: _InstantImages, cut: Cut, frames: float, least: Array
-    ) -> tuple[Aligned, _InstantImages]:
+        self, expected: Expected, look: InstantImages, cut: Cut, frames: float, least: Array
+    ) -> tuple[Aligned, InstantImages]:
         """Align from the prediction; if this may have failed, from other starts, and then by a search in larger crops.
 
         Results of a search are accepted only if the matched fraction reaches `least`, shape (2,).
@@ -223,7 +236,7 @@ class RigTracker:
         return far_away if (fitting_share(far_away.solution) >= least).all() else found, look
 
     def _with_habitual_starts(
-        self, expected: Expected, look: _InstantImages, rough: Aligned, found: Aligned
+        self, expected: Expected, look: InstantImages, rough: Aligned, found: Aligned
     ) -> tuple[Aligned, Aligned]:
         """Return a rough alignment and its refinement; with one camera, also align from poses nearer to habitual ones.
 
@@ -232,18 +245,21 @@ class RigTracker:
         alone = look.use.any(axis=0).sum() == 1 and not (self._effort.in_turn and self._failed > self._effort.searches)
         if not alone or not (fitting_share(found.solution) < THOROUGH.uncertain * self._usual_share()).any():
             return rough, found
-        gates = self._effort.wide_px or self._effort.gates_px
-        for kept in ([1.0, 0.0, 1.0], [1.0, 1.0, 0.0]):  # no laterotrusion, no protrusion
-            start = replace(expected.pose, d=expected.pose.d * kept)
-            trial = look.align(start, Expected(start, _loose(expected)), gates)
+        for trial in self._habitual(expected, look):
             fine = look.polished(trial)
             if _better(found, fine) is fine:
                 rough, found = trial, fine
         return rough, found
 
+    def _habitual(self, expected: Expected, look: InstantImages) -> Iterator[Aligned]:
+        """Yield alignments from the expected pose without laterotrusion, and without protrusion."""
+        for kept in ([1.0, 0.0, 1.0], [1.0, 1.0, 0.0]):
+            start = replace(expected.pose, d=expected.pose.d * kept)
+            yield look.align(start, Expected(start, _loose(expected)), self._effort.wide_px or self._effort.gates_px)
+
     def _best_in_turn(
-        self, found: Aligned, expected: Expected, look: _InstantImages, cut: Cut
-    ) -> tuple[Aligned, _InstantImages]:
+        self, found: Aligned, expected: Expected, look: InstantImages, cut: Cut
+    ) -> tuple[Aligned, InstantImages]:
         """Search for jaw and head in different frames, to limit the time per frame while teeth are not visible."""
         turn = self._failed % self._effort.later_every
         if turn == 0:
@@ -253,7 +269,7 @@ class RigTracker:
             return self._with_head_searched(found, expected, look), look
         return found, look
 
-    def _with_head_searched(self, found: Aligned, expected: Expected, look: _InstantImages) -> Aligned:
+    def _with_head_searched(self, found: Aligned, expected: Expected, look: InstantImages) -> Aligned:
         """Try shifted head poses with an unchanged jaw pose."""
         shifts = head_shifts(expected.pose.head, self._colours.axes)
         order = rank_by_colour(list(shifts @ expected.pose.head), look.views, self._instants.solver.scans, 0)
@@ -265,7 +281,7 @@ class RigTracker:
         gates = self._effort.wide_px or self._effort.gates_px
         return look.align(found.pose, Expected(found.pose, LARGEST_SIGMA**-2.0), gates)
 
-    def _searched(self, found: Aligned, expected: Expected, look: _InstantImages) -> Aligned:
+    def _searched(self, found: Aligned, expected: Expected, look: InstantImages) -> Aligned:
         """Try jaw poses over the whole range of motion, ranked by the image colours at the projected teeth."""
         head, jaw = found.pose.head, self._coordinates.jaw
         places = [head @ jaw.pose(d) for d in self._jaws]
@@ -281,66 +297,12 @@ class RigTracker:
         return found
 
 
-class _InstantImages:
-    """Images of one frame and the rendering shared by all alignments."""
-
-    def __init__(
-        self,
-        instants: InstantSolver,
-        colours: LearnedColours,
-        pictures: Sequence[Picture | None],
-        before: Array,
-        whole: InstantSolver | None,
-    ) -> None:
-        self._instants, self._colours, self._pictures, self._whole = instants, colours, pictures, whole
-        self.views = colours.views(pictures, before)
-        self._rendering = instants.solver.rendering(self.views)
-        self.use = present_masks(self.views)
-
-    def align(self, start: Pose, expected: Expected, gates_px: Sequence[float]) -> Aligned:
-        """Return the most likely pose near a start."""
-        weight = np.full(2, 1.0 / BORDER_PX3)
-        return self._instants.align(start, self.views, self.use, gates_px, expected, weight, self._rendering)
-
-    def polished(self, found: Aligned) -> Aligned:
-        """Refine an alignment with all faces and the same prior; visibility is not recomputed."""
-        if self._whole is None:
-            return found
-        weight = np.full(2, 1.0 / BORDER_PX3)
-        self._counting = views = self._colours.counting(self.views)
-        return self._whole.align(found.pose, views, self.use, LAST_GATES_PX, found.expected, weight, self._rendering)
-
-    def upper_crowns(self, pose: Pose) -> list[Mask]:
-        """Return masks of the pixels that upper crowns cover at a pose, one per view."""
-        self._instants.linearise(pose, self.views, self.use, self._rendering, self._instants.config.final_gate_px[1])
-        return [labels[0] == CROWN for labels in self._rendering.labels]
-
-    def learn(self, pose: Pose, rates: tuple[float, float]) -> None:
-        """Update the colour models from both sides of the borders matched at a pose."""
-        if self._whole is None:
-            self._counting, gate = self._colours.counting(self.views), self._instants.config.final_gate_px[1]
-            self._instants.linearise(pose, self._counting, self.use, self._rendering, gate)
-        self._colours.learn(self._counting, self._pictures, self._instants.coordinates.arches(pose), rates)
-
-    def fit(self, found: Aligned, trusted: Mask, free_focal: bool) -> FrameFit:
-        """Return the fit of the frame, in which only arches in `trusted` (2,) count as found."""
-        use = self.use & trusted[:, None]
-        unknown = np.full(use.shape, np.nan)
-        if not free_focal or not trusted.any():
-            return FrameFit(found.pose, found.solution, use, use, unknown)
-        matched: list[Matched] = []
-        gate, instants = self._instants.config.final_gate_px[1], self._whole or self._instants
-        solution = instants.linearise(found.pose, self.views, use, self._rendering, gate, True, matched)
-        growth = growth_of(matched, solution.poses, solution.centres, self.views)
-        return FrameFit(found.pose, solution, use, use, unknown, growth)
-
-
 @dataclass(frozen=True, eq=False)
 class _Begun:
     """A first frame: the colours learned in it, its images, its rough and its refined alignment, and the pose prior."""
 
     colours: LearnedColours
-    look: _InstantImages
+    look: InstantImages
     rough: Aligned
     found: Aligned
     expected: Expected
@@ -360,4 +322,8 @@ def _loose(expected: Expected) -> Array:
 
 def _better(one: Aligned, other: Aligned) -> Aligned:
     """Return the alignment with more matched contour."""
-    return other if score_px(other.solution).sum() > score_px(one.solution).sum() else one
+    return other if _matched_score(other) > _matched_score(one) else one
+
+
+def _matched_score(found: Aligned) -> float:
+    return float(score_px(found.solution).sum())
