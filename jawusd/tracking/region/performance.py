@@ -48,8 +48,9 @@ _FIRST_FRAMES, _FOCAL_ROUNDS = 120, 3
 _BORDERS = AnnotatorPrior(common=(0.0, 0.0, 0.0), arch=(0.4, 0.08, 0.02), camera=(0.0, 0.0), frames=5.0)
 _CORRELATION_PX = 80.0
 # With one camera, poses of single frames are off by millimetres along the view, so that their contours are matched at
-# wrong distances. The number of rounds in which they are matched again at the smoothed poses of the take.
-_AGAIN_ALONE = 2
+# wrong distances. Maximum number of rounds in which they are matched again at the smoothed poses of the take, and
+# change of d below which the rounds end [mm].
+_AGAIN_ALONE, _UNCHANGED_MM = 6, 0.1
 _OFF_MM = 1.0  # possible error of an unconfirmed pose next to lost frames above which the pose is left out
 _CLEARLY = 1.05  # minimum ratio of matched contour for another pose to replace a trusted one
 
@@ -141,8 +142,11 @@ class PictureTake:
         fits = self._follow(cameras, (frame, start), shot.frames, head, progress, recover=True)
         smoothed = self._smoothed(shot.frames, fits, jaw_of_skin(shot.skin, shot.frames, fits))
         for _ in range(_AGAIN_ALONE if len(cameras) == 1 else 0):
+            before = _parameters(smoothed)
             fits = self._again(cameras, head, frame, smoothed.fits, progress)
             smoothed = self._smoothed(shot.frames, fits, jaw_of_skin(shot.skin, shot.frames, fits))
+            if np.abs(_parameters(smoothed) - before).max() < _UNCHANGED_MM:
+                break
         if shot.free_focal:
             log_focal = smoothed.state.log_focal + np.log(factors)
             smoothed = replace(smoothed, state=replace(smoothed.state, log_focal=log_focal))
@@ -250,6 +254,11 @@ class PictureTake:
             skin=skin,
         )
         return smoother.run(fits)
+
+
+def _parameters(smoothed: Smoothed) -> Array:
+    """Return the jaw parameters of all frames [mm], shape (F, 3)."""
+    return np.stack([fit.pose.d for fit in smoothed.fits])
 
 
 def _fitting_px(fit: FrameFit) -> float:
