@@ -223,15 +223,19 @@ class PictureTake:
     def _again(
         self, cameras: Sequence[Camera], head: float, start: int, fits: Sequence[FrameFit], progress: Progress
     ) -> list[FrameFit]:
-        """Return the fits of all frames, aligned once more from the poses of smoothed fits."""
+        """Return the fits of all frames, aligned once more from the poses of smoothed fits.
+
+        Args:
+            start: frame in which the colours are learned.
+            fits: smoothed fits of all frames.
+        """
         shot = self._shot
         smoothed, found = dict(zip(shot.frames, fits, strict=True)), dict[int, FrameFit]()
         tracker, begin = self._began(cameras, head, start, smoothed[start].pose)
         for way in both_ways(start, shot.frames):
-            same = tracker.reversed_from(begin)
-            frames = range(start, way.stop, way.step)
-            for frame, cut in zip(frames, self._shot.cuts(cameras, self._centre(begin.pose), frames), strict=True):
-                found[frame] = same.again(cut, smoothed[frame])
+            one_way, frames = tracker.reversed_from(begin), range(start, way.stop, way.step)
+            for frame, cut in zip(frames, shot.cuts(cameras, self._centre(begin.pose), frames), strict=True):
+                found[frame] = one_way.again(cut, smoothed[frame])
                 progress(len(found), len(fits))
         return [found[frame] for frame in shot.frames]
 

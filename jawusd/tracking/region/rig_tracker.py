@@ -43,7 +43,6 @@ _JAWS = 96  # number of jaw poses that a search ranks by colour
 # of 18 rendered subjects (`tests/benchmarks/looks.py`), aligned from true poses, 5 jaws were off by 2.5 to 6.7 mm; with
 # this choice, the largest error is 1.95 mm.
 _NEAR_MIDDLE, _CLEARER = 1.0 / 3.0, 1.2
-
 # With one camera, teeth that are nearly closed may match the image at several poses. Opening below which other poses
 # are aligned [mm], distance from which they differ [mm], and ratio of matched contour above which they fit as well.
 _CLOSED_MM, _APART_MM, _SIMILAR = 2.0, 1.0, 0.75
@@ -161,7 +160,7 @@ class RigTracker:
         return False
 
     def _judged(self, look: InstantImages, rough: Aligned, found: Aligned, least: Array, otherwise: Pose) -> FrameFit:
-        """Return the fit of a frame, and learn from it if it is good.
+        """Return the fit of a frame, and learn its colours and usual fit if both arches are found.
 
         Args:
             least: matched fraction of each arch above which it is found, shape (2,).
