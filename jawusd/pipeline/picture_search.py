@@ -40,7 +40,7 @@ _SHORTEST_UP = 0.5
 # of one take 0.19 to 0.48. In images turned the wrong way, wrong starts reach 0.02 to 0.20. With one camera, 33 of 39
 # correct starts in 27 views of 13 subjects reach 0.32 to 0.73, the others 0.13 to 0.27; 26 wrong ones reach at most
 # 0.26.
-_LEAST_FIT, _CLEAR_FIT = (0.15, 0.28), (0.25, 0.4)
+_LEAST_FIT, _CLEAR_FIT = (0.15, 0.4), (0.25, 0.6)
 
 T = TypeVar("T")
 T_co = TypeVar("T_co", covariant=True)

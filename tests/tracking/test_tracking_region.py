@@ -19,6 +19,7 @@ from jawusd.segmentation.picture import ColourFootage
 from jawusd.tracking.contour.samples import COLUMNS, INVERSE_DEPTH, LENGTH, NX, NY, U, V, X, Y
 from jawusd.tracking.contour.scan import CROWN, prepare_scan
 from jawusd.tracking.contour.views import Drawn
+from jawusd.tracking.performance.coordinates import Pose
 from jawusd.tracking.region import rig_tracker
 from jawusd.tracking.region import tracker as region_tracker
 from jawusd.tracking.region.colours import BINS, PATCHES, TABLES, Areas, CameraColours, colour_bins
@@ -26,7 +27,8 @@ from jawusd.tracking.region.creases import search_creases
 from jawusd.tracking.region.edges import _light, search_borders, sharpen
 from jawusd.tracking.region.effort import THOROUGH
 from jawusd.tracking.region.rig_tracker import RigTracker
-from jawusd.tracking.region.view import Counts, RegionView
+from jawusd.tracking.region.search import fraction_in_sight
+from jawusd.tracking.region.view import Counts, RegionView, measure_in_sight
 from jawusd.tracking.sequence.guided import GuidedTracker
 
 TOOTH, LIP = np.array([215.0, 205.0, 185.0]), np.array([150.0, 75.0, 80.0])
@@ -120,6 +122,52 @@ def test_what_the_other_arch_hides_says_nothing():
     nearer = np.full((SIZE, SIZE), 1 / 190, np.float32)
     distances, weights = searched(picture, share, samples_at(RADIUS), other_depth=nearer)
     assert np.isnan(distances).all() and np.isnan(weights).all()
+
+
+def test_contours_without_tooth_colours_inside_are_not_in_sight():
+    picture, share = disc()
+    picture[: int(MIDDLE)] = LIP  # lips hide the upper half
+    bins = colour_bins(picture)
+    whole = CameraColours(bins, Areas(share > 0.99, share < 0.01, np.zeros_like(share, bool), share < 0))
+    tables = np.zeros(90, np.int64)
+    clearness = np.where(np.arange(90) < 10, np.nan, 0.0)  # the other arch hides ten samples of the lower half
+    seen = [measure_in_sight(samples_at(RADIUS), tables, bins, whole.ratio[0], c) for c in (np.zeros(90), clearness)]
+    np.testing.assert_allclose(seen, [45, 35], atol=2)
+    assert measure_in_sight(samples_at(RADIUS + 8), tables, bins, whole.ratio[0], np.zeros(90)) == 0
+
+
+@pytest.mark.parametrize(("in_sight_px", "expected"), [(80.0, 0.5), (20.0, 40 / 60), (0.0, 40 / 60)])
+def test_a_fit_counts_the_contour_in_sight_but_not_too_little_of_it(in_sight_px, expected):
+    counts = Counts.zeros()
+    counts.in_sight_px[:] = in_sight_px
+    view = RegionView(None, None, None, None, None, None, counts)
+    matched = SimpleNamespace(score_px=np.full((2, 1), 25.0)), SimpleNamespace(score_px=np.full((2, 1), 15.0))
+    solution = SimpleNamespace(silhouette=matched[0], gingival_margin=matched[1], visible_px=np.full((2, 1), 200.0))
+    np.testing.assert_allclose(fraction_in_sight(solution, [SimpleNamespace(edges=view)]), expected)
+
+
+@pytest.mark.parametrize(("cameras", "fit", "others"), [(1, 0.4, 4), (1, 0.7, 0), (2, 0.4, 0)])
+def test_unclear_starts_of_one_camera_are_also_aligned_from_elsewhere(monkeypatch, cameras, fit, others):
+    tried = []
+
+    def begun(cut, pose, jaw):
+        tried.append(pose.head[:3, 3].tolist())
+        use, views = np.ones((2, cameras), bool), [SimpleNamespace(eye=np.array([0.0, 0.0, -200.0]))] * cameras
+        look = SimpleNamespace(use=use, views=views, fit=lambda *_: SimpleNamespace(found=None))
+        aligned = SimpleNamespace(pose=pose)
+        own = 0.9 if pose.head[0, 3] < 0 else fit
+        rough = SimpleNamespace(solution=None)
+        return SimpleNamespace(look=look, found=aligned, rough=rough, fit=own, share=0.2, colours=None, expected=None)
+
+    monkeypatch.setattr(rig_tracker, "fitting_share", lambda solution: np.full(2, 0.2))
+    monkeypatch.setattr(rig_tracker, "Prediction", lambda *_, **__: None)
+    tracker = RigTracker.__new__(RigTracker)
+    tracker._colours, tracker._coordinates = SimpleNamespace(axes=np.eye(3)), SimpleNamespace(pivot=np.zeros(3))
+    tracker._head, tracker._free_focal, tracker._usual, tracker._begun = 1.0, False, deque(), begun
+    tracker.begin(None, Pose(np.eye(4), np.array([5.0, 1.0, 1.0])))
+    elsewhere = [[-8, 0, 0], [8, 0, 0], [0, 0, -7], [0, 0, 7]]
+    assert tried == [[0, 0, 0]] * (2 if cameras == 1 else 1) + elsewhere[:others]
+    assert tracker.first_fit == (0.2 if cameras > 1 else 0.9 if fit < 0.5 else fit)
 
 
 def test_without_teeth_no_border_is_found():

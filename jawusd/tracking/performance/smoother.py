@@ -62,7 +62,7 @@ class Smoother:
         *,
         fixed_head: bool = False,
         free_focal: bool = False,
-        length_px: float | None = None,
+        shared_px3: float = 0.0,
         annotator: AnnotatorPrior | None = None,
         skin: SkinJaw | None = None,
     ) -> None:
@@ -77,12 +77,12 @@ class Smoother:
             cameras: number of cameras.
             fixed_head: whether the head pose is constant.
             free_focal: whether to estimate the focal lengths.
-            length_px: correlation length of outline errors; default: estimated from the residuals.
+            shared_px3: variance times correlation length [px^3] of outline errors that the residuals do not show.
             annotator: prior on annotator bias; default: of hand-drawn masks.
             skin: jaw parameters estimated from facial skin in every frame, if known.
         """
         self._skin = None if skin is None else SkinFactor(skin, fps, WIDER)
-        self._cameras, self._rounds, self._length_px = cameras, _FOCAL_ROUNDS if free_focal else _ROUNDS, length_px
+        self._cameras, self._rounds, self._shared_px3 = cameras, _FOCAL_ROUNDS if free_focal else _ROUNDS, shared_px3
         if views is None:
             self._rounds = 0
         self._instants, self._views, self._frames, self._fps = instants, views, frames, fps
@@ -105,7 +105,7 @@ class Smoother:
         """
         config, fits = self._instants.config, list(fits)
         state, slow = self._unknowns.start(), np.zeros((len(fits), SLOW))
-        weight = 1.0 / outline_variance(fits, config, self._length_px)
+        weight = 1.0 / (outline_variance(fits, config) + self._shared_px3)
         good = np.array([fit.found.all() for fit in fits])
         motion = measured_motion(self._coordinates, [fit.pose for fit in fits], good, self._fps)
         total = self._rounds * len(fits)
@@ -129,7 +129,7 @@ class Smoother:
             for k, fit in enumerate(fits):
                 fits[k] = self._matched(fit, self._frames[k], state)
                 done(round_ * len(fits) + k + 1, total)
-            weight = 1.0 / outline_variance(fits, config, self._length_px)
+            weight = 1.0 / (outline_variance(fits, config) + self._shared_px3)
         sigma = np.zeros(self._cameras)
         # The bound of the rig is omitted: it is an inequality, and would make the covariance too small.
         covariance, shared = self._covariance(self._system(fits, state, weight, motion, slow, None))
@@ -278,14 +278,12 @@ def with_one_head(coordinates: Coordinates, fits: Sequence[FrameFit]) -> list[Fr
     return [replace(fit, pose=replace(fit.pose, head=head)) for fit in fits]
 
 
-def outline_variance(fits: Sequence[FrameFit], config: TrackingConfig, length_px: float | None = None) -> Array:
+def outline_variance(fits: Sequence[FrameFit], config: TrackingConfig) -> Array:
     """Return variance times correlation length of the outline errors of a take, per arch [px^3], shape (2,).
 
-    By default, the correlation length is estimated from the residuals.
+    The correlation length is estimated from the residuals.
     """
     solutions = [(fit.solution, fit.found) for fit in fits if fit.solution is not None and fit.found.any()]
-    if length_px is not None:
-        return np.asarray(usual_residual_px(fits) ** 2 * length_px, np.float64)
     lengths = np.array([np.where(found, correlation_px(solution, config), np.nan) for solution, found in solutions])
     known = lengths[np.isfinite(lengths)]
     length = float(np.median(known)) if len(known) else config.correlation_px

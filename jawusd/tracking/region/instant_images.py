@@ -15,7 +15,7 @@ from jawusd.tracking.performance.coordinates import Pose
 from jawusd.tracking.performance.instant import Aligned, Expected, InstantSolver
 from jawusd.tracking.performance.views import growth_of
 from jawusd.tracking.region.appearance import LearnedColours, Picture
-from jawusd.tracking.region.search import BORDER_PX3, LAST_GATES_PX
+from jawusd.tracking.region.search import BORDER_PX3, LAST_GATES_PX, fraction_in_sight
 
 
 class InstantImages:
@@ -46,6 +46,10 @@ class InstantImages:
         weight = np.full(2, 1.0 / BORDER_PX3)
         self._counting = views = self._colours.counting(self.views)
         return self._whole.align(found.pose, views, self.use, LAST_GATES_PX, found.expected, weight, self._rendering)
+
+    def fraction_in_sight(self, found: Aligned) -> Array:
+        """Return the matched fraction of each arch's contour in sight, shape (2,), after colours were learned."""
+        return fraction_in_sight(found.solution, self._counting)
 
     def upper_crowns(self, pose: Pose) -> list[Mask]:
         """Return masks of the pixels that upper crowns cover at a pose, one per view."""

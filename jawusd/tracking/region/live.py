@@ -23,7 +23,6 @@ from jawusd.tracking.performance.smoother import WIDER
 from jawusd.tracking.region.appearance import CORRELATION_PX, Cut, LearnedColours
 from jawusd.tracking.region.effort import FAST
 from jawusd.tracking.region.rig_tracker import RigTracker
-from jawusd.tracking.region.search import fitting_share
 
 _FACES = 3_000
 # The settings are coarser than for recorded images, since dropped frames reduce accuracy more than coarse settings.
@@ -60,13 +59,11 @@ class LiveTake:
         self._tracker: RigTracker | None = None
 
     def begin(self, cut: Cut, near: Pose) -> float:
-        """Learn the colours of a frame near a pose; return the matched fraction of the visible contour, 0 .. 1."""
+        """Learn the colours of a frame near a pose; return its `RigTracker.first_fit`, 0 .. 1."""
         colours = LearnedColours(self._scans, self._cameras, self._axes)
         self._tracker = RigTracker(self._instants, colours, head=self._head, effort=FAST)
-        solution = self._tracker.begin(cut, near).solution
-        if solution is None:
-            return 0.0
-        return float(fitting_share(solution).min())
+        self._tracker.begin(cut, near)
+        return self._tracker.first_fit
 
     def step(self, cut: Cut, frames: float = 1.0) -> FrameFit:
         """Align the images taken `frames` frames after the previous ones.

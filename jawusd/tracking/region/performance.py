@@ -27,7 +27,7 @@ from jawusd.tracking.performance.skin import SkinOf, jaw_of_skin
 from jawusd.tracking.performance.smoother import Smoothed, Smoother, with_one_head
 from jawusd.tracking.region.appearance import Cut, LearnedColours
 from jawusd.tracking.region.rig_tracker import RigTracker
-from jawusd.tracking.region.search import FACES, REDRAW_PX, SAMPLE_STEP_PX, fitting_share
+from jawusd.tracking.region.search import FACES, REDRAW_PX, SAMPLE_STEP_PX
 
 #: Function that returns the cropped images of a range of frames. Arguments: cameras, possibly with changed focal
 #: lengths; a world point near the teeth, which determines the resolution [mm], shape (3,); and the frames.
@@ -42,11 +42,13 @@ _LAST_FACES, _SETTLED_MM = 20_000, 0.08
 # Number of frames from which a fixed head pose and unknown focal lengths are estimated in advance, and number of rounds
 # for focal lengths.
 _FIRST_FRAMES, _FOCAL_ROUNDS = 120, 3
-# Prior on the offsets between colour borders and tooth edges in a take; and correlation length of the residuals along
-# an outline [px]. Teeth darken towards their edges, so borders lie up to half a pixel inside; gum-line offsets are
-# learned while tracking.
+# Prior on the offsets between colour borders and tooth edges in a take. Teeth darken towards their edges, so borders
+# lie up to half a pixel inside; gum-line offsets are learned while tracking.
 _BORDERS = AnnotatorPrior(common=(0.0, 0.0, 0.0), arch=(0.4, 0.08, 0.02), camera=(0.0, 0.0), frames=5.0)
-_CORRELATION_PX = 80.0
+# Variance times correlation length of border errors that neighbouring borders share, such as shading [px^3]. Residuals
+# of rendered subjects are 0.18 px, correlated over 8 px, but their poses are off as if correlated over 80 px. In
+# path-traced images, residuals of 0.6 px, as correlated over 8 px, are noise.
+_SHARED_PX3 = 2.6
 # With one camera, poses of single frames are off by millimetres along the view, so that their contours are matched at
 # wrong distances. Maximum number of rounds in which they are matched again at the smoothed poses of the take, and
 # change of d below which the rounds end [mm].
@@ -115,16 +117,13 @@ class PictureTake:
         )
 
     def begun(self, frame: int, near: Pose) -> tuple[Pose, float]:
-        """Return the pose in a frame near a guess, and the matched fraction of the visible contour, 0 .. 1.
+        """Return the pose in a frame near a guess, and its `RigTracker.first_fit`, 0 .. 1.
 
         Raises:
             CaptureError: an image cannot be decoded.
         """
-        fit = self._begin(self._shot.cameras, 1.0, frame, near).pose
-        solution = fit.solution
-        if solution is None or not fit.found.all():
-            return fit.pose, 0.0
-        return fit.pose, float(fitting_share(solution).min())
+        tracker, fit = self._began(self._shot.cameras, 1.0, frame, near)
+        return fit.pose, tracker.first_fit
 
     def solve(self, frame: int, start: Pose, progress: Progress = lambda done, total: None) -> Performance:
         """Solve head pose and jaw parameters of every frame.
@@ -253,7 +252,7 @@ class PictureTake:
             len(shot.cameras),
             fixed_head=shot.fixed_head,
             free_focal=shot.free_focal,
-            length_px=_CORRELATION_PX,
+            shared_px3=_SHARED_PX3,
             annotator=_BORDERS,
             skin=skin,
         )

@@ -10,7 +10,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from jawusd.base.arrays import Array
-from jawusd.geometry import transform_points
+from jawusd.geometry import transform_point, transform_points
+from jawusd.tracking.contour.equations import translation
 from jawusd.tracking.contour.quality import matched_px, score_px
 from jawusd.tracking.initialization.first_frame import FIRST_ROUNDS
 from jawusd.tracking.performance.attempts import LARGEST_SIGMA, FrameFit
@@ -43,6 +44,9 @@ _JAWS = 96  # number of jaw poses that a search ranks by colour
 # of 18 rendered subjects (`tests/benchmarks/looks.py`), aligned from true poses, 5 jaws were off by 2.5 to 6.7 mm; with
 # this choice, the largest error is 1.95 mm.
 _NEAR_MIDDLE, _CLEARER = 1.0 / 3.0, 1.2
+# With one camera, both arches may fit about the width of a tooth beside their true places, or at a wrong distance from
+# the camera. First frames in which they fit less than the last value [-] are also aligned from poses moved so far [mm].
+_TOOTH_MM, _DEEPER_MM, _CLEAR_ALONE = 8.0, 7.0, 0.6
 # With one camera, teeth that are nearly closed may match the image at several poses. Opening below which other poses
 # are aligned [mm], distance from which they differ [mm], and ratio of matched contour above which they fit as well.
 _CLOSED_MM, _APART_MM, _SIMILAR = 2.0, 1.0, 0.75
@@ -53,6 +57,8 @@ class RigTracker:
 
     Attributes:
         expected: pose prior of the last step.
+        first_fit: matched fraction of the visible contour in the first frame, 0 .. 1, of the worse arch; with one
+            camera, of the contour in sight.
     """
 
     def __init__(
@@ -85,22 +91,39 @@ class RigTracker:
 
     def begin(self, cut: Cut, pose: Pose) -> FrameFit:
         """Learn colours from a first frame at a pose accurate to a few tenths of a millimetre; return the frame fit."""
-        sigma = LARGEST_SIGMA * np.r_[[min(1.0, self._head)] * 6, [1.0] * 3]
-        begun = self._begun(cut, pose, sigma)
-        if begun.look.use.any(axis=0).sum() == 1:
+        begun = self._begun(cut, pose, 1.0)
+        alone = begun.look.use.any(axis=0).sum() == 1
+        if alone:
             middle = replace(pose, d=pose.d * [1.0, 0.0, 0.0])
-            usual = self._begun(cut, middle, sigma * np.r_[[1.0] * 6, [_NEAR_MIDDLE] * 3])
+            usual = self._begun(cut, middle, _NEAR_MIDDLE)
             if begun.share <= _CLEARER * usual.share:
                 begun = usual
+            if self._head == 1.0 and begun.fit < _CLEAR_ALONE:
+                others = [replace(middle, head=head) for head in self._other_heads(begun)]
+                begun = max(begun, *(self._begun(cut, other, 1.0) for other in others), key=lambda other: other.fit)
         self._colours, self.expected = begun.colours, begun.expected
         fit = begun.look.fit(begun.found, np.ones(2, bool), self._free_focal)
         self._motion = Prediction(self._coordinates, begun.found.pose, fit.found, head=self._head)
         self._first = fitting_share(begun.rough.solution)
+        self.first_fit = begun.fit if alone else begun.share
         self._usual.append(self._first)
         return fit
 
-    def _begun(self, cut: Cut, pose: Pose, sigma: Array) -> _Begun:
-        """Return a first frame aligned near a pose with standard deviations (9,), with colours learned in it."""
+    def _other_heads(self, begun: _Begun) -> list[Array]:
+        """Return head poses (4, 4) to either side of that of a first frame of one camera, in front of and behind it."""
+        head = begun.found.pose.head
+        (eye,) = (view.eye for view, used in zip(begun.look.views, begun.look.use.any(axis=0), strict=True) if used)
+        away = transform_point(head, self._coordinates.pivot) - eye
+        ways = (_TOOTH_MM * head[:3, :3] @ self._colours.axes[0], _DEEPER_MM * away / np.linalg.norm(away))
+        return [translation(sign * way) @ head for way in ways for sign in (-1.0, 1.0)]
+
+    def _begun(self, cut: Cut, pose: Pose, jaw: float) -> _Begun:
+        """Return a first frame aligned near a pose, with colours learned in it.
+
+        Args:
+            jaw: factor on the standard deviations of the jaw parameters.
+        """
+        sigma = LARGEST_SIGMA * np.r_[[min(1.0, self._head)] * 6, [jaw] * 3]
         colours, arches = self._colours.copy(), self._coordinates.arches(pose)
         colours.begin(cut(arches), arches)
         for _ in range(FIRST_ROUNDS):
@@ -310,6 +333,11 @@ class _Begun:
     def share(self) -> float:
         """Fraction of the visible contour of the worse arch that fits."""
         return float(fitting_share(self.found.solution).min())
+
+    @property
+    def fit(self) -> float:
+        """Matched fraction of the contour in sight, of the worse arch."""
+        return float(self.look.fraction_in_sight(self.found).min())
 
 
 def _loose(expected: Expected) -> Array:

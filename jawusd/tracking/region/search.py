@@ -64,6 +64,9 @@ BORDER_PX3 = 0.7**2 * CORRELATION_PX  # border variance times correlation length
 # Penalty per unit of the condyles' squared Mahalanobis distance, as length of matched contour [px]: Tukey's loss of a
 # sample beyond the gate is 4.685^2 / 6, and neighbouring samples are correlated over `CORRELATION_PX`.
 _STRAIN_PX = 0.5 * CORRELATION_PX * 6.0 / 4.685**2
+# Minimum length of the contour in sight, as a fraction of the contour that the other arch does not hide [-]. Of a wrong
+# pose, little may be in sight, and match by chance.
+_LEAST_IN_SIGHT = 0.3
 _FAST_MM = 1.0  # predicted motion per frame above which other starts are tried [mm]
 # Number of starts that a search tries near the last poses, number of starts that it tries anywhere in the human range
 # of motion, and number of starts that it aligns fully. Colours rank the correct start among the first 22 of 57.
@@ -243,6 +246,17 @@ def _upper_alone(views: Sequence[View]) -> Mask:
     use = present_masks(views)
     use[1] = False
     return use
+
+
+def fraction_in_sight(solution: Solution, views: Sequence[View]) -> Array:
+    """Return the matched fraction of the contour in sight, per arch, shape (2,), from views with counts.
+
+    Unlike `fitting_share`, it does not depend on how much of the teeth is hidden by the lips.
+    """
+    counts = [view.edges.counts for view in views if isinstance(view.edges, RegionView)]
+    in_sight_px = np.sum([count.in_sight_px for count in counts if count is not None], axis=0)
+    least_px = _LEAST_IN_SIGHT * solution.visible_px.sum(1)
+    return np.asarray(score_px(solution).sum(1) / np.maximum(np.maximum(in_sight_px, least_px), 1.0), np.float64)
 
 
 def fitting_share(solution: Solution) -> Array:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jawusd.base.arrays import Array
-from jawusd.tracking.contour.samples import NX, NY, U, V, X, Y, Z, pixel_of
+from jawusd.tracking.contour.samples import LENGTH, NX, NY, U, V, X, Y, Z, pixel_of
 from jawusd.tracking.contour.scan import GUM
 from jawusd.tracking.contour.views import Drawn
 from jawusd.tracking.region.colours import BINS, KINDS, TABLES
@@ -33,6 +33,8 @@ _SURE, _GUM_REACH_PX, _FEWEST_GUM = 0.3, 2.5, 30
 _CLEAR_RATIO = 1.0  # minimum mean log ratio on both sides for full weight of a border [-]
 _SHARPEN_PX = 5.0  # maximum search range for which borders are refined by colour [px]
 _CONTRAST, _SHARP_REACH_PX = 20.0, 2.0  # minimum contrast of refined borders [8-bit steps]; maximum refinement
+# A contour is in sight where the mean log ratio at these distances inside it [px] exceeds this value [-].
+_INNER_PX, _TOOTH_RATIO = (1.5, 2.5, 3.5, 4.5), 0.3
 _CREASE_CONTRAST, _CREASE_WEIGHT, _CREASE_REACH_PX = 25.0, 0.5, 7.0
 
 
@@ -86,6 +88,33 @@ def measure_blur(samples: Array, before: Array, shutter: float, out: Array) -> N
         out[s] = shutter * abs((sample[U] - u) * sample[NX] + (sample[V] - v) * sample[NY])
 
 
+@numba.njit(nogil=True, cache=True)
+def measure_in_sight(
+    samples: Array, tables: NDArray[np.int64], bins: NDArray[np.uint16], ratio: NDArray[np.float32], clearness: Array
+) -> float:
+    """Return the length of contour beside which the image has tooth colours on the inner side [px].
+
+    Args:
+        samples, tables, bins, ratio: as in `search_borders`.
+        clearness: weights of the borders, NaN where the other arch hides the sample, shape (n,).
+    """
+    height, width = bins.shape
+    length = 0.0
+    for s in range(len(samples)):
+        sample = samples[s]
+        if np.isnan(clearness[s]):
+            continue
+        total, count = 0.0, 0
+        for depth in _INNER_PX:
+            i, j = pixel_of(sample[U] - depth * sample[NX]), pixel_of(sample[V] - depth * sample[NY])
+            if 0 <= i < width and 0 <= j < height:
+                total += ratio[tables[s], bins[j, i]]
+                count += 1
+        if total > _TOOTH_RATIO * count:
+            length += sample[LENGTH]
+    return length
+
+
 @dataclass(frozen=True, eq=False)
 class Counts:
     """Statistics collected beside the borders matched in an image."""
@@ -93,11 +122,12 @@ class Counts:
     tooth: Array  # colours inside borders, shape (2, TABLES, BINS)
     outside: Array  # colours outside borders, shape (2, TABLES, BINS)
     gum_px: Array  # outward offset of observed gum lines from those of the scans [px], NaN if not measured, shape (2,)
+    in_sight_px: Array  # length of contour beside which the image shows teeth in the last search [px], shape (2,)
 
     @classmethod
     def zeros(cls) -> Counts:
         """Return statistics without any counts."""
-        return cls(np.zeros((2, TABLES, BINS)), np.zeros((2, TABLES, BINS)), np.full(2, np.nan))
+        return cls(np.zeros((2, TABLES, BINS)), np.zeros((2, TABLES, BINS)), np.full(2, np.nan), np.zeros(2))
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,6 +179,7 @@ class RegionView:
         sums = (counts.tooth[arch], counts.outside[arch])
         labels = (drawn.own, drawn.other)
         count_colours(samples, tables, distances, clearness, self.bins, *labels, *_LEARNED_PX, *sums)
+        counts.in_sight_px[arch] = measure_in_sight(samples, tables, self.bins, self.ratio[arch], clearness)
         line = (tables % KINDS == 1) & (clearness > _SURE) & (np.abs(distances) < _GUM_REACH_PX)
         if line.sum() > _FEWEST_GUM:
             counts.gum_px[arch] = np.median(distances[line])
