@@ -146,8 +146,11 @@ def test_a_fit_counts_the_contour_in_sight_but_not_too_little_of_it(in_sight_px,
     np.testing.assert_allclose(fraction_in_sight(solution, [SimpleNamespace(edges=view)]), expected)
 
 
-@pytest.mark.parametrize(("cameras", "fit", "others"), [(1, 0.4, 4), (1, 0.7, 0), (2, 0.4, 0)])
-def test_unclear_starts_of_one_camera_are_also_aligned_from_elsewhere(monkeypatch, cameras, fit, others):
+@pytest.mark.parametrize(
+    ("cameras", "fit", "searched", "others"),
+    [(1, 0.4, True, 4), (1, 0.4, False, 0), (1, 0.7, True, 0), (2, 0.4, True, 0)],
+)
+def test_unclear_starts_of_one_camera_are_also_aligned_from_elsewhere(monkeypatch, cameras, fit, searched, others):
     tried = []
 
     def begun(cut, pose, jaw):
@@ -164,10 +167,10 @@ def test_unclear_starts_of_one_camera_are_also_aligned_from_elsewhere(monkeypatc
     tracker = RigTracker.__new__(RigTracker)
     tracker._colours, tracker._coordinates = SimpleNamespace(axes=np.eye(3)), SimpleNamespace(pivot=np.zeros(3))
     tracker._head, tracker._free_focal, tracker._usual, tracker._begun = 1.0, False, deque(), begun
-    tracker.begin(None, Pose(np.eye(4), np.array([5.0, 1.0, 1.0])))
+    tracker.begin(None, Pose(np.eye(4), np.array([5.0, 1.0, 1.0])), searched=searched)
     elsewhere = [[-8, 0, 0], [8, 0, 0], [0, 0, -7], [0, 0, 7]]
     assert tried == [[0, 0, 0]] * (2 if cameras == 1 else 1) + elsewhere[:others]
-    assert tracker.first_fit == (0.2 if cameras > 1 else 0.9 if fit < 0.5 else fit)
+    assert tracker.first_fit == (0.2 if cameras > 1 else 0.9 if others else fit)
 
 
 def test_without_teeth_no_border_is_found():

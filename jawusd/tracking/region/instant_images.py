@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -15,7 +16,7 @@ from jawusd.tracking.performance.coordinates import Pose
 from jawusd.tracking.performance.instant import Aligned, Expected, InstantSolver
 from jawusd.tracking.performance.views import growth_of
 from jawusd.tracking.region.appearance import LearnedColours, Picture
-from jawusd.tracking.region.search import BORDER_PX3, LAST_GATES_PX, fraction_in_sight
+from jawusd.tracking.region.search import BORDER_PX3, LAST_GATES_PX, fitting_share, fraction_in_sight
 
 
 class InstantImages:
@@ -74,3 +75,24 @@ class InstantImages:
         solution = instants.linearise(found.pose, self.views, use, self._rendering, gate, True, matched)
         growth = growth_of(matched, solution.poses, solution.centres, self.views)
         return FrameFit(found.pose, solution, use, use, unknown, growth)
+
+
+@dataclass(frozen=True, eq=False)
+class Begun:
+    """A first frame: the colours learned in it, its images, its rough and its refined alignment, and the pose prior."""
+
+    colours: LearnedColours
+    look: InstantImages
+    rough: Aligned
+    found: Aligned
+    expected: Expected
+
+    @property
+    def share(self) -> float:
+        """Fraction of the visible contour of the worse arch that fits."""
+        return float(fitting_share(self.found.solution).min())
+
+    @property
+    def fit(self) -> float:
+        """Matched fraction of the contour in sight, of the worse arch."""
+        return float(self.look.fraction_in_sight(self.found).min())

@@ -62,7 +62,7 @@ class LiveTake:
         """Learn the colours of a frame near a pose; return its `RigTracker.first_fit`, 0 .. 1."""
         colours = LearnedColours(self._scans, self._cameras, self._axes)
         self._tracker = RigTracker(self._instants, colours, head=self._head, effort=FAST)
-        self._tracker.begin(cut, near)
+        self._tracker.begin(cut, near, searched=True)
         return self._tracker.first_fit
 
     def step(self, cut: Cut, frames: float = 1.0) -> FrameFit:

@@ -122,7 +122,7 @@ class PictureTake:
         Raises:
             CaptureError: an image cannot be decoded.
         """
-        tracker, fit = self._began(self._shot.cameras, 1.0, frame, near)
+        tracker, fit = self._began(self._shot.cameras, 1.0, frame, near, searched=True)
         return fit.pose, tracker.first_fit
 
     def solve(self, frame: int, start: Pose, progress: Progress = lambda done, total: None) -> Performance:
@@ -181,11 +181,14 @@ class PictureTake:
 
         return Begin(at, fit, follow)
 
-    def _began(self, cameras: Sequence[Camera], head: float, at: int, near: Pose) -> tuple[RigTracker, FrameFit]:
-        """Return a tracker that begins in a frame near a guess, and the fit of that frame."""
+    def _began(
+        self, cameras: Sequence[Camera], head: float, at: int, near: Pose, searched: bool = False
+    ) -> tuple[RigTracker, FrameFit]:
+        """Return a tracker that begins in a frame near a guess, and the fit of that frame; see `RigTracker.begin`."""
         colours = LearnedColours(self._scans, cameras, self._axes)
         tracker = RigTracker(self._rough, colours, head=head, free_focal=self._shot.free_focal, whole=self._instants)
-        return tracker, tracker.begin(next(self._shot.cuts(cameras, self._centre(near), range(at, at + 1))), near)
+        cut = next(self._shot.cuts(cameras, self._centre(near), range(at, at + 1)))
+        return tracker, tracker.begin(cut, near, searched=searched)
 
     def _centre(self, pose: Pose) -> Array:
         return teeth_centre(self._scans, self.coordinates.arches(pose))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterator
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -21,7 +21,7 @@ from jawusd.tracking.performance.motion import Prediction
 from jawusd.tracking.performance.single_start import spread_out
 from jawusd.tracking.region.appearance import FIRST_RATES, RATES, Cut, LearnedColours
 from jawusd.tracking.region.effort import FAR_GATES_PX, THOROUGH, Effort
-from jawusd.tracking.region.instant_images import InstantImages
+from jawusd.tracking.region.instant_images import Begun, InstantImages
 from jawusd.tracking.region.search import (
     AGAIN,
     LEAST_USUAL,
@@ -89,8 +89,12 @@ class RigTracker:
         self._least_px = instants.config.least_matched_px
         self._failed = self._frame = 0
 
-    def begin(self, cut: Cut, pose: Pose) -> FrameFit:
-        """Learn colours from a first frame at a pose accurate to a few tenths of a millimetre; return the frame fit."""
+    def begin(self, cut: Cut, pose: Pose, *, searched: bool = False) -> FrameFit:
+        """Learn colours from a first frame near a pose; return the frame fit.
+
+        Args:
+            searched: whether the pose is the result of a search, so that one camera tries others if it hardly fits.
+        """
         begun = self._begun(cut, pose, 1.0)
         alone = begun.look.use.any(axis=0).sum() == 1
         if alone:
@@ -98,7 +102,7 @@ class RigTracker:
             usual = self._begun(cut, middle, _NEAR_MIDDLE)
             if begun.share <= _CLEARER * usual.share:
                 begun = usual
-            if self._head == 1.0 and begun.fit < _CLEAR_ALONE:
+            if searched and begun.fit < _CLEAR_ALONE:
                 others = [replace(middle, head=head) for head in self._other_heads(begun)]
                 begun = max(begun, *(self._begun(cut, other, 1.0) for other in others), key=lambda other: other.fit)
         self._colours, self.expected = begun.colours, begun.expected
@@ -109,15 +113,15 @@ class RigTracker:
         self._usual.append(self._first)
         return fit
 
-    def _other_heads(self, begun: _Begun) -> list[Array]:
+    def _other_heads(self, begun: Begun) -> list[Array]:
         """Return head poses (4, 4) to either side of that of a first frame of one camera, in front of and behind it."""
         head = begun.found.pose.head
-        (eye,) = (view.eye for view, used in zip(begun.look.views, begun.look.use.any(axis=0), strict=True) if used)
-        away = transform_point(head, self._coordinates.pivot) - eye
+        (camera,) = np.flatnonzero(begun.look.use.any(axis=0))
+        away = transform_point(head, self._coordinates.pivot) - begun.look.views[camera].eye
         ways = (_TOOTH_MM * head[:3, :3] @ self._colours.axes[0], _DEEPER_MM * away / np.linalg.norm(away))
         return [translation(sign * way) @ head for way in ways for sign in (-1.0, 1.0)]
 
-    def _begun(self, cut: Cut, pose: Pose, jaw: float) -> _Begun:
+    def _begun(self, cut: Cut, pose: Pose, jaw: float) -> Begun:
         """Return a first frame aligned near a pose, with colours learned in it.
 
         Args:
@@ -133,7 +137,7 @@ class RigTracker:
             found = look.polished(rough)
             pose = found.pose
             look.learn(pose, FIRST_RATES)
-        return _Begun(colours, look, rough, found, Expected(pose, sigma**-2.0))
+        return Begun(colours, look, rough, found, Expected(pose, sigma**-2.0))
 
     def reversed_from(self, begin: FrameFit) -> RigTracker:
         """Return an independent tracker that starts again from the first frame with the colours learned so far."""
@@ -317,27 +321,6 @@ class RigTracker:
             around = Expected(trial.pose, loose)
             found = _better(found, look.align(trial.pose, around, self._effort.wide_px or self._effort.gates_px))
         return found
-
-
-@dataclass(frozen=True, eq=False)
-class _Begun:
-    """A first frame: the colours learned in it, its images, its rough and its refined alignment, and the pose prior."""
-
-    colours: LearnedColours
-    look: InstantImages
-    rough: Aligned
-    found: Aligned
-    expected: Expected
-
-    @property
-    def share(self) -> float:
-        """Fraction of the visible contour of the worse arch that fits."""
-        return float(fitting_share(self.found.solution).min())
-
-    @property
-    def fit(self) -> float:
-        """Matched fraction of the contour in sight, of the worse arch."""
-        return float(self.look.fraction_in_sight(self.found).min())
 
 
 def _loose(expected: Expected) -> Array:
