@@ -37,9 +37,9 @@ _SHORTEST_UP = 0.5
 # Limits of the fraction of the visible contour that matches the colours, with several cameras and with one. Starts
 # below the first are rejected. One above the second ends the search; others are compared with those of other frames
 # and orientations. With several cameras, correct starts of 15 subjects reach 0.31 to 0.58, and those in single frames
-# of one take 0.19 to 0.48. In images turned the wrong way, wrong starts reach 0.02 to 0.20. With one camera, 33 of 39
-# correct starts in 27 views of 13 subjects reach 0.32 to 0.73, the others 0.13 to 0.27; 26 wrong ones reach at most
-# 0.26.
+# of one take 0.19 to 0.48. In images turned the wrong way, wrong starts reach 0.02 to 0.20. With one camera, lips count
+# as hiding the contour (`RigTracker.first_fit`): in 12 views of 8 subjects, correct starts reach 0.42 to 0.87, and
+# wrong ones 0.12 to 0.33.
 _LEAST_FIT, _CLEAR_FIT = (0.15, 0.4), (0.25, 0.6)
 
 T = TypeVar("T")

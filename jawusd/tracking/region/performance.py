@@ -45,9 +45,9 @@ _FIRST_FRAMES, _FOCAL_ROUNDS = 120, 3
 # Prior on the offsets between colour borders and tooth edges in a take. Teeth darken towards their edges, so borders
 # lie up to half a pixel inside; gum-line offsets are learned while tracking.
 _BORDERS = AnnotatorPrior(common=(0.0, 0.0, 0.0), arch=(0.4, 0.08, 0.02), camera=(0.0, 0.0), frames=5.0)
-# Variance times correlation length of border errors that neighbouring borders share, such as shading [px^3]. Residuals
-# of rendered subjects are 0.18 px, correlated over 8 px, but their poses are off as if correlated over 80 px. In
-# path-traced images, residuals of 0.6 px, as correlated over 8 px, are noise.
+# Variance times correlation length of errors that neighbouring borders share, such as shading, in addition to that of
+# the residuals [px^3]. Of rendered subjects, residuals of 0.18 px have a correlation length of 8 px, but the poses are
+# off as if it were 80 px. Of path-traced ones, residuals of 0.4 to 1.1 px add noise with the same length.
 _SHARED_PX3 = 2.6
 # With one camera, poses of single frames are off by millimetres along the view, so that their contours are matched at
 # wrong distances. Maximum number of rounds in which they are matched again at the smoothed poses of the take, and
