@@ -39,7 +39,7 @@ _SHORTEST_UP = 0.5
 # and orientations. With several cameras, correct starts of 15 subjects reach 0.31 to 0.58, and those in single frames
 # of one take 0.19 to 0.48. In images turned the wrong way, wrong starts reach 0.02 to 0.20. With one camera, lips count
 # as hiding the contour (`RigTracker.first_fit`): in 12 views of 8 subjects, correct starts reach 0.42 to 0.87, and
-# wrong ones 0.12 to 0.33.
+# wrong ones 0.12 to 0.37.
 _LEAST_FIT, _CLEAR_FIT = (0.15, 0.4), (0.25, 0.6)
 
 T = TypeVar("T")

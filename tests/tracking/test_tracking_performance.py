@@ -234,6 +234,23 @@ def test_the_bound_pulls_a_jaw_inside_but_makes_it_no_surer(jaw, scans, truth, c
     np.testing.assert_allclose(beyond.covariance[:, 6:, 6:], inside.covariance[:, 6:, 6:], rtol=1e-6)
 
 
+def test_shared_errors_of_borders_add_to_the_variance_of_the_residuals(jaw, scans, truth, monkeypatch):
+    instants = InstantSolver(ContourSolver(scans, TrackingConfig()), Coordinates(jaw, scans))
+    none = np.zeros((2, 1), bool)
+    fits = [FrameFit(Pose(truth[1][0], truth[0][0]), None, none, none, np.full(none.shape, np.nan))] * 5
+    monkeypatch.setattr(smoother, "outline_variance", lambda *_: np.array([3.0, 1.0]))
+    smoothing, weights = Smoother(instants, None, range(5), 25.0, 1, shared_px3=2.0), []
+    system = smoothing._system
+
+    def weighted(fits, state, weight, *more):
+        weights.append(weight)
+        return system(fits, state, weight, *more)
+
+    monkeypatch.setattr(smoothing, "_system", weighted)
+    smoothing.run(fits)
+    np.testing.assert_allclose(weights, np.tile([1 / 5, 1 / 3], (len(weights), 1)))
+
+
 @pytest.mark.parametrize("bounds", [1, 5])
 def test_smoothing_does_not_close_the_jaw_farther_than_the_teeth(jaw, scans, truth, monkeypatch, bounds):
     """The outlines ask for a step from a jaw that is slightly open to one that is closed by 1.5 mm too far."""
