@@ -23,7 +23,7 @@ from jawusd.tracking.contour.scan import prepare_scan, teeth_centre
 from jawusd.tracking.contour.solver import ContourSolver
 from jawusd.tracking.contour.views import MaskViews, masked_sources
 from jawusd.tracking.initialization.footage import Footage
-from jawusd.tracking.performance import smoother
+from jawusd.tracking.performance import single_start, smoother
 from jawusd.tracking.performance.attempts import FrameFit
 from jawusd.tracking.performance.coordinates import JAW, LOCAL, Coordinates, Pose
 from jawusd.tracking.performance.instant import Equations, Expected, InstantSolver, bound_equations
@@ -347,9 +347,41 @@ def begun(jaw, scans, truth, folder, camera):
 
 
 @pytest.mark.slow
-def test_one_camera_finds_where_to_begin(jaw, scans, truth, folder):
-    away = begun(jaw, scans, truth, folder, small_take.CAMERAS[0])
+@pytest.mark.parametrize("turns", [0, 1])
+def test_one_camera_finds_where_to_begin(jaw, scans, truth, folder, tmp_path, turns):
+    """The camera may lie on its side."""
+    camera = small_take.CAMERAS[0]
+    turned_folder = shutil.copytree(folder, tmp_path / "turned")
+    for path in turned_folder.rglob("*.png"):
+        cv2.imwrite(str(path), np.rot90(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), turns))
+    away = begun(jaw, scans, truth, turned_folder, turned(camera, turns))
     assert np.abs(away[:3]).max() < 0.03 and np.abs(away[3:]).max() < 1.5
+
+
+@pytest.mark.parametrize("turns", [1, 2, 3])
+def test_the_distances_tried_do_not_depend_on_how_the_camera_is_turned(folder, turns):
+    """The width of the teeth is measured along the arches, not along the rows of the image."""
+    camera, k = small_take.CAMERAS[0], small_take.START
+    masks = np.stack([cv2.imread(str(small_take.png(folder, camera.name, row, k)), 0) for row in ("upper", "lower")])
+    upright, sideways = (
+        single_start._places(
+            SimpleNamespace(
+                masks=np.rot90(masks, n, axes=(1, 2)), matrix=view.projection_matrix(), eye=view.centre_world()
+            )
+        )
+        for n, view in ((0, camera), (turns, turned(camera, turns)))
+    )
+    np.testing.assert_allclose(sideways, upright, atol=1.0)
+
+
+def turned(camera, turns):
+    """Return a camera turned about its axis, whose images are those of the given one after `np.rot90`."""
+    for _ in range(turns):
+        (width, height), K = camera.size_px, camera.K.copy()
+        K[[0, 1], [0, 1]], K[:2, 2] = camera.K[[1, 0], [1, 0]], (camera.K[1, 2], width - 1 - camera.K[0, 2])
+        quarter = np.array([[0.0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+        camera = replace(camera, K=K, T_cam_world=quarter @ camera.T_cam_world, size_px=(height, width))
+    return camera
 
 
 @pytest.mark.slow

@@ -242,13 +242,14 @@ def spread_out(jaw: JawRig, count: int) -> Array:
 
 def _places(view: View) -> Array:
     """Return the 3-D centres of both arches [mm], shape (W, 2, 3), for every candidate width of the visible teeth."""
-    middles, columns = np.ones((2, 3)), np.flatnonzero((view.masks > 127).any((0, 1)))
-    for r, mask in enumerate(view.masks):
-        rows, across = np.nonzero(mask > 127)
-        middles[r, :2] = across.mean(), rows.mean()
+    pixels = [np.argwhere(mask > 127)[:, ::-1] for mask in view.masks]
+    middles = np.array([[*of_arch.mean(0), 1.0] for of_arch in pixels])
+    # The camera may be turned about its axis, so the width is measured along the arches.
+    _, axes = np.linalg.eigh(sum(np.cov(of_arch.T) * len(of_arch) for of_arch in pixels))
+    width_px = float(np.ptp(np.concatenate(pixels) @ axes[:, 1]))
     # If the third row of the camera matrix has unit length, the scale factor along a ray is the depth.
     matrix = view.matrix / np.linalg.norm(view.matrix[2, :3])
     rays = np.linalg.solve(matrix[:, :3], middles.T).T
     focal_px = float(np.linalg.norm(np.cross(matrix[0, :3], matrix[2, :3])))
-    depths = focal_px * _WIDTHS_MM / max(float(np.ptp(columns)), 1.0)
+    depths = focal_px * _WIDTHS_MM / max(width_px, 1.0)
     return np.asarray(view.eye + depths[:, None, None] * rays, np.float64)
