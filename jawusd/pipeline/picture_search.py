@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Generic, Protocol, TypeVar
 
 import numpy as np
@@ -52,7 +52,7 @@ class StartInFrame(Protocol[T_co]):
     def at(
         self, masks: Sequence[FrameMasks], cameras: Mapping[str, Camera], offsets: Mapping[str, int], frame: int
     ) -> T_co | None:
-        """Return the most likely pose in a frame with rough masks, or None."""
+        """Return the most likely pose in a frame with rough masks, or None if there is none or cameras are too few."""
 
     def picked(self, bootstrap: Bootstrap, cameras: Mapping[str, Camera]) -> T_co:
         """Return the pose from picks in two or more cameras."""
@@ -110,7 +110,8 @@ class PictureSearch(Generic[T]):
 
         `up_world` is the up direction of the head in the world, shape (3,), if known from other frames. If it is given,
         one camera orientation is tried and, with several cameras, the first start that fits is returned, because it
-        can be compared with those frames. Otherwise, four orientations are tried.
+        can be compared with those frames. Otherwise, four orientations are tried. If no start of several cameras fits,
+        starts of single cameras are tried in the frame with the best one.
 
         Progress is reported for frames searched and for starts tried.
 
@@ -123,6 +124,7 @@ class PictureSearch(Generic[T]):
         clear = _CLEAR_FIT[single] if single or up_world is None else least
         hypotheses = orientations(self.cameras) if up_world is None else [upright_turns(self.cameras, up_world)]
         best: Start[T] | None = None
+        nearest: _Candidate | None = None
         tried: list[int] = []
         seen = 0
         for part in (frames[k : k + _PART] for k in range(0, len(frames), _PART)):
@@ -135,13 +137,16 @@ class PictureSearch(Generic[T]):
                     found = self._at(candidate)
                     progress("try starts", done, len(candidates))
                     if found is not None and (best is None or found.fit > best.fit):
-                        best = found
+                        best, nearest = found, candidate
                     if best is not None and best.fit >= clear:
                         return best
             if best is not None and best.fit >= least:
                 return best
             if len(tried) >= _MOST_TRIED:
                 break
+        best = max(filter(None, [best, *self._alone(nearest)]), key=lambda start: start.fit, default=None)
+        if best is not None and best.fit >= least:
+            return best
         raise TrackingError(
             _describe_failure(tried, best, least, frames[seen:]),
             hint="Check that the scans or the rig belong to this subject. Otherwise, film with the mouth open "
@@ -162,6 +167,12 @@ class PictureSearch(Generic[T]):
         masks = rough_masks(candidate.rows, self.offsets, candidate.frame)
         near = self.near.at(masks, self.cameras, self.offsets, candidate.frame)
         return None if near is None else Start(candidate.frame, *self.judged(candidate.frame, near), "search")
+
+    def _alone(self, candidate: _Candidate | None) -> Iterator[Start[T] | None]:
+        """Yield starts that the masks of single cameras give, judged in all cameras."""
+        if candidate is not None and len(candidate.rows) > 1:
+            for name, rows in candidate.rows.items():
+                yield self._at(replace(candidate, rows={name: rows}))
 
     def picked(self, picks: Bootstrap, frames: range, least_fit: float) -> Start[T]:
         """Return a start of tracking from picks.

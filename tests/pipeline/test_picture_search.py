@@ -43,10 +43,11 @@ class _Footage:
 def searched(monkeypatch):
     """Search with a given fit per frame; return the outcome and the frames tried.
 
-    `seen` returns how many pixels of each arch are visible in a frame.
+    `seen` returns how many pixels of each arch are visible in a frame; `alone` is the fit of starts from the masks of
+    one camera of two, by camera.
     """
 
-    def run(fit_of, upright=0, progress=no_progress, seen=lambda frame: (0, 0), cameras=tuple(CAMERAS)):
+    def run(fit_of, upright=0, progress=no_progress, seen=lambda frame: (0, 0), cameras=tuple(CAMERAS), alone=None):
         def rows(picture, turns):
             masks = np.where(np.arange(16).reshape(4, 4) < np.reshape(seen(int(picture)), (2, 1, 1)), 255, 0)
             return Rows(masks.astype(np.uint8), 0.05) if upright in (turns, None) else None
@@ -56,7 +57,7 @@ def searched(monkeypatch):
 
         def near(sources, cameras, offsets, frame):
             tried.append(frame)
-            fits.append(fit_of(frame))
+            fits.append(fit_of(frame) if alone is None or len(sources) > 1 else alone[sources[0].name])
             return None if fits[-1] is None else "pose"
 
         near_rows = SimpleNamespace(at=near)
@@ -121,6 +122,14 @@ def test_one_camera_needs_a_better_fit(searched):
     assert searched(lambda frame: fit)[0].fit == fit
     words, _, _ = searched(lambda frame: fit, cameras=["cam0"])
     assert f"at best {fit:.0%} of the visible contour fits; at least {least_fit(1):.0%} is needed" in words
+
+
+def test_starts_of_single_cameras_are_tried_if_those_of_several_do_not_fit(searched):
+    fits = {"cam0": 0.01, "cam1": LEAST_FIT + 0.01}
+    begin, tried, _ = searched(lambda frame: 0.5 * LEAST_FIT if frame == 18 else 0.01, alone=fits)
+    assert (begin.frame, begin.fit) == (18, fits["cam1"]) and tried[-2:] == [18, 18]
+    words, _, _ = searched(lambda frame: 0.01, alone=dict.fromkeys(fits, 0.9 * LEAST_FIT))
+    assert f"at best {0.9 * LEAST_FIT:.0%} of the visible contour fits" in words
 
 
 @pytest.mark.parametrize("quarters", [(0, 0, 0), (1, 0, 0), (0, 2, 0), (0, 0, 3), (1, 1, 1), (2, 2, 2), (3, 1, 0)])

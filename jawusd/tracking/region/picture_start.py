@@ -17,7 +17,7 @@ from jawusd.media.masks import FrameMasks
 from jawusd.tracking.config import Mapper, TrackingConfig
 from jawusd.tracking.contour.scan import ARCH_NAMES, Scan
 from jawusd.tracking.contour.solver import ContourSolver
-from jawusd.tracking.contour.views import masked_sources
+from jawusd.tracking.contour.views import FEWEST_CAMERAS, masked_sources
 from jawusd.tracking.initialization.bootstrap import pose_from_picks
 from jawusd.tracking.initialization.footage import Footage
 from jawusd.tracking.initialization.scan_checks import check_occlusion
@@ -74,15 +74,17 @@ class ArchStart:
     def at(
         self, masks: Sequence[FrameMasks], cameras: Mapping[str, Camera], offsets: Mapping[str, int], frame: int
     ) -> Array | None:
-        """Return the most likely poses in a frame with rough masks, shape (2, 4, 4), or None.
+        """Return the most likely poses in a frame with rough masks, shape (2, 4, 4); None if there are none.
 
         Args:
-            masks: masks of that frame, of two or more cameras.
+            masks: masks of that frame; with one camera, the result is None.
             cameras, offsets: calibrations and time offsets by camera name; an offset is the reference frame number
                 minus the camera's own.
             frame: frame number of the reference camera.
         """
-        masked = masked_sources(masks, cameras, offsets, 2)
+        if len(masks) < FEWEST_CAMERAS:
+            return None
+        masked = masked_sources(masks, cameras, offsets)
         try:
             return self._search.at(Footage(masked, cameras, offsets, (frame, frame + 1), 2), frame).poses
         except TrackingError:
