@@ -1,131 +1,25 @@
-"""A synthetic subject: seeded joint parameters within human ranges, poses, and the set of possible poses.
+"""A synthetic subject: seeded joint parameters within human ranges, and poses.
 
 Ranges: opening and excursions after Hirsch et al. 2006 and Travers et al. 2000, condylar inclination and Bennett angle
 after Johnson and Winstanley 1997 and Cadiax studies, condylar travel after Muto and Kanazawa 1996.
-
-A pose is possible if it lies on the subject's three-parameter manifold with controls inside their ranges. The nearest
-possible pose is found by bounded Gauss-Newton steps from the best node of a coarse grid, on distances of mandible
-points.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from jawusd.base.arrays import Array, Mask
-from jawusd.geometry import transform_point, transform_points
+from jawusd.base.arrays import Array
+from jawusd.geometry import transform_point
 from jawusd.synthetic.kinematics import Joint, controlled_pose
-
-PoseFunction = Callable[[Array, Array, Array], Array]
 
 _LOWER = np.array([0.0, -1.0, -1.0])
 _UPPER = np.array([1.0, 1.0, 1.0])
-_GRID = (13, 9, 9)
-# Number of Gauss-Newton steps; this many are needed near zero protrusion, where the manifold has a kink.
-_STEPS = 30
-_DIFFERENCE = 1e-5
-# Damping relative to the scale of each control, since the controls' gradients differ by a factor of ten.
-_DAMPING = 1e-3
-_CHUNK = 2000
+_COMPETING = 1.3  # exponent of the competing envelope
 EnvelopeKind = Literal["box", "competing"]
-
-
-class Envelope:
-    """Set of possible controls of one subject, with projection onto this set."""
-
-    def __init__(self, pose: PoseFunction, points: Array, exponent: float | None) -> None:
-        """Prepare the grid of start values.
-
-        Args:
-            pose: maps opening, lateral and protrusion (...) to T_skull_mandible (..., 4, 4).
-            points: mandible points [mm], shape (P, 3).
-            exponent: None for independent ranges, p for |lateral|^p + max(protrusion, 0)^p <= 1.
-        """
-        self._pose = pose
-        self._points = points
-        self._exponent = exponent
-        axes = [np.linspace(low, high, n) for low, high, n in zip(_LOWER, _UPPER, _GRID, strict=True)]
-        self._grid = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
-        self._few = points[np.linspace(0, len(points) - 1, 6).astype(int)]
-        self._grid_points = self._moved(self._grid, self._few)
-
-    def limit(self, controls: Array) -> Array:
-        """Return controls (..., 3) inside the ranges: clipped, then lateral and protrusion scaled down jointly."""
-        controls = np.clip(controls, _LOWER, _UPPER)
-        if self._exponent is None:
-            return controls
-        p = self._exponent
-        size = (np.abs(controls[..., 1]) ** p + np.maximum(controls[..., 2], 0.0) ** p) ** (1.0 / p)
-        shrink = 1.0 / np.maximum(size, 1.0)
-        lateral, protrusion = controls[..., 1] * shrink, controls[..., 2]
-        protrusion = np.where(protrusion > 0, protrusion * shrink, protrusion)
-        return np.stack([controls[..., 0], lateral, protrusion], -1)
-
-    def nearest(self, T: Array, bounded: bool) -> tuple[Array, Array]:
-        """Return controls (..., 3) of the nearest pose on the manifold, and the largest point distance [mm] (...)."""
-        flat = T.reshape(-1, 4, 4)
-        parts = [self._nearest(flat[i : i + _CHUNK], bounded) for i in range(0, len(flat), _CHUNK)]
-        if not parts:
-            return np.zeros((*T.shape[:-2], 3)), np.zeros(T.shape[:-2])
-        controls, distance = (np.concatenate(part) for part in zip(*parts, strict=True))
-        return controls.reshape(*T.shape[:-2], 3), distance.reshape(T.shape[:-2])
-
-    def _moved(self, controls: Array, points: Array) -> Array:
-        """Return points (P, 3) transformed by the poses at controls (N, 3), shape (N, 3 P)."""
-        T = self._pose(controls[:, 0], controls[:, 1], controls[:, 2])
-        return transform_points(T, points).reshape(len(controls), -1)
-
-    def _start(self, T: Array) -> Array:
-        """Return the controls of the grid nodes nearest to poses (N, 4, 4), shape (N, 3)."""
-        target = transform_points(T, self._few).reshape(len(T), -1)
-        squares = (self._grid_points**2).sum(1) - 2 * target @ self._grid_points.T
-        return self._grid[squares.argmin(1)]
-
-    def _nearest(self, T: Array, bounded: bool) -> tuple[Array, Array]:
-        target = transform_points(T, self._points).reshape(len(T), -1)
-        controls = self._start(T)
-        if bounded:
-            controls = self.limit(controls)
-        damping = np.full(len(T), _DAMPING)
-        error = target - self._moved(controls, self._points)
-        cost = (error**2).sum(1)
-        for _ in range(_STEPS):
-            step = self._step(controls, error, damping, bounded)
-            trial = controls + step
-            if bounded:
-                trial = self.limit(trial)
-            trial_error = target - self._moved(trial, self._points)
-            trial_cost = (trial_error**2).sum(1)
-            better = trial_cost < cost
-            controls = np.where(better[:, None], trial, controls)
-            error = np.where(better[:, None], trial_error, error)
-            cost = np.where(better, trial_cost, cost)
-            damping = np.where(better, damping * 0.2, damping * 10.0)
-        distance = np.linalg.norm(error.reshape(len(T), -1, 3), axis=-1).max(-1)
-        return controls, distance
-
-    def _step(self, controls: Array, error: Array, damping: Array, bounded: bool) -> Array:
-        """Take a damped Gauss-Newton step; controls at a bound with an outward gradient are fixed."""
-        now = self._moved(controls, self._points)
-        jacobian = np.stack(
-            [(self._moved(controls + _DIFFERENCE * e, self._points) - now) / _DIFFERENCE for e in np.eye(3)], -1
-        )
-        gradient = np.einsum("nij,ni->nj", jacobian, error)
-        normal = np.einsum("nij,nik->njk", jacobian, jacobian)
-        diagonal = np.einsum("njj->nj", normal)
-        free = np.ones_like(controls, dtype=bool)
-        if bounded:
-            held = ((controls <= _LOWER) & (gradient < 0)) | ((controls >= _UPPER) & (gradient > 0))
-            free = ~held
-        normal = normal * free[:, :, None] * free[:, None, :]
-        index = np.arange(3)
-        normal[:, index, index] = np.where(free, diagonal * (1.0 + damping[:, None]) + 1e-9, 1.0)
-        return np.linalg.solve(normal, (gradient * free)[..., None])[..., 0]
 
 
 def _asymmetric(rng: np.random.Generator, value: float, relative: float) -> Array:
@@ -207,7 +101,7 @@ class Person:
         self.mandible_points = _mandible_points(self.joint)
         first_molars = self.joint.incisor + np.array([[22.0, 0.5, -26.0], [-22.0, 0.5, -26.0]])
         self.landmarks = np.concatenate([self.joint.incisor[None], first_molars, self.joint.condyles])
-        self._envelope = Envelope(self.pose, self.mandible_points, exponent=1.3 if envelope == "competing" else None)
+        self._envelope = envelope
 
     def pose(self, opening: ArrayLike, lateral: ArrayLike, protrusion: ArrayLike) -> Array:
         """Return mandible poses (..., 4, 4) on the three-parameter manifold of the subject; see `controlled_pose`."""
@@ -224,27 +118,14 @@ class Person:
         return controlled_pose(self.joint, opening, lateral, protrusion, extra_mm)
 
     def limit(self, controls: ArrayLike) -> Array:
-        """Return controls (..., 3) limited to the envelope; controls inside it are unchanged."""
-        return self._envelope.limit(np.asarray(controls, dtype=np.float64))
-
-    def nearest(self, T_skull_mandible: ArrayLike, bounded: bool = True) -> tuple[Array, Array]:
-        """Find the poses of the manifold nearest to given poses (..., 4, 4), by the rms distance of mandible points.
-
-        Args:
-            bounded: whether to stay within the envelope. If not, the distance is a lower limit on the error of any
-                three-parameter fit.
-
-        Returns:
-            Controls (..., 3), and the largest distance of a mandible point [mm], shape (...).
-        """
-        return self._envelope.nearest(np.asarray(T_skull_mandible, dtype=np.float64), bounded)
-
-    def is_valid(self, T_skull_mandible: ArrayLike, tolerance_mm: float = 1.0) -> Mask:
-        """Return which poses (..., 4, 4) are possible: all mandible points within the tolerance of a possible pose.
-
-        Movements outside the three controls alone displace points by up to 0.7 mm.
-        """
-        return self.nearest(T_skull_mandible)[1] <= tolerance_mm
+        """Return controls (..., 3) clipped to the envelope; lateral and protrusion are scaled down jointly."""
+        limited: Array = np.clip(np.asarray(controls, dtype=np.float64), _LOWER, _UPPER)
+        if self._envelope == "box":
+            return limited
+        opening, lateral, protrusion = np.moveaxis(limited, -1, 0)
+        size = (np.abs(lateral) ** _COMPETING + np.maximum(protrusion, 0.0) ** _COMPETING) ** (1.0 / _COMPETING)
+        shrink = 1.0 / np.maximum(size, 1.0)
+        return np.stack([opening, lateral * shrink, np.where(protrusion > 0, protrusion * shrink, protrusion)], -1)
 
     def incisor(self, T_skull_mandible: ArrayLike) -> Array:
         """Return the displacement of the lower incisal point from rest [mm], scan axes, shape (..., 3)."""

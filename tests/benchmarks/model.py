@@ -15,10 +15,16 @@ for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ[variable] = "1"
 
 import argparse  # noqa: E402
+import sys  # noqa: E402
 import time  # noqa: E402
+from pathlib import Path  # noqa: E402
 
 import numpy as np  # noqa: E402
 from model_peers import PEERS  # noqa: E402
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
+
+from possible_poses import PossiblePoses  # noqa: E402
 
 from jawusd.evaluator import JawRig  # noqa: E402
 from jawusd.fitting import FittingConfig, fit_model  # noqa: E402
@@ -41,7 +47,8 @@ class Subject:
         self.person = Person(seed, envelope)
         self.T_anatomical_skull = make_transform(np.eye(3), -self.person.landmarks[0])
         self.hidden = record(self.person, HIDDEN, SEED_HIDDEN, "hidden").T_noisy
-        self.floor = self.person.nearest(self.hidden, bounded=False)[1]
+        self.possible = PossiblePoses(self.person)
+        self.floor = self.possible.nearest(self.hidden, bounded=False)[1]
 
     def take(self, frames: int = TRAINING, noise: float = 1.0) -> np.ndarray:
         """Return a training take."""
@@ -197,7 +204,7 @@ def one_bound(subject: Subject) -> list[float]:
     rng = np.random.default_rng(5)
     low, high = hidden.min(0) - 3, hidden.max(0) + 3
     tried = low + (high - low) * rng.random((3000, 3))
-    truly = subject.person.is_valid(rig.pose(tried))
+    truly = subject.possible.include(rig.pose(tried))
     figures = []
     for bound in ("slices", "polygons"):
         margin, of_hidden = rig.margin(tried, bound=bound), rig.margin(hidden, bound=bound)
@@ -209,7 +216,7 @@ def one_bound(subject: Subject) -> list[float]:
         d[:, 0] = opening
         d[:, axis] = np.linspace(*rig.d_range[axis], 60)
         sweep.append(d[rig.margin(d) > 0])
-    return [*figures, float(subject.person.is_valid(rig.pose(np.concatenate(sweep))).mean())]
+    return [*figures, float(subject.possible.include(rig.pose(np.concatenate(sweep))).mean())]
 
 
 def falsely_accepted(accepted: np.ndarray, truly: np.ndarray) -> float:

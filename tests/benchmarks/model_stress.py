@@ -80,7 +80,7 @@ def one_person(seed: int, envelope: str) -> None:
     moved = np.stack([rig.point_jacobian(d, point) for point in subject.person.mandible_points], axis=1)
     values = np.linalg.svd(moved.reshape(len(d), -1, 3), compute_uv=False)
     swept = sweeps(rig)
-    off = subject.person.nearest(rig.pose(swept))[1]
+    off = subject.possible.nearest(rig.pose(swept))[1]
     within = covered(subject, rig, model.meta["uncertainty"])
     print(
         f"{envelope:<10} {seed}   {back:12.1e} mm {(values[:, 0] / values[:, 2]).max():9.2f}   "

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from possible_poses import PossiblePoses
 
 from jawusd.geometry import rigidity_defect, se3_exp, se3_log, transform_point, transform_points
 from jawusd.synthetic.exercises import record
@@ -116,8 +117,8 @@ def test_recordings_have_the_stated_noise_and_stay_possible(kind: str) -> None:
 
     assert 0.25 < worst(take.T_noisy, take.T_true).mean() < 0.37
     assert 0.12 < worst(take.T_true, take.T_manifold).mean() < 0.35
-    assert person.nearest(take.T_manifold)[1].max() < 0.02
-    assert person.is_valid(take.T_true).mean() > 0.99
+    assert PossiblePoses(person).nearest(take.T_manifold)[1].max() < 0.02
+    assert PossiblePoses(person).include(take.T_true).mean() > 0.99
     assert take.T_noisy.shape == (833, 4, 4) and take.controls.shape == (833, 3) and take.phase.shape == (833,)
     assert (np.ptp(take.controls, axis=0) > [0.9, 1.5, 1.5]).all()
     speed = np.linalg.norm(np.diff(person.incisor(take.T_true), axis=0), axis=-1) * 24
@@ -145,28 +146,29 @@ def test_impossible_poses_are_refused(people: list[Person]) -> None:
         good = person.pose(0.4, 0.3, 0.2)
         twists = [[0, 0, 0, 0, 3.0, 0], [0, 0, 0, 6.0, 0, 0], [0, 0.1, 0, 0, 0, 0], [0, 0, 0.06, 0, 0, 0]]
         beyond = person.pose([1.15, 0.0, 0.0], [0.0, 1.4, 0.0], [0.0, 0.0, 1.4])
-        verdicts = person.is_valid(np.concatenate([good[None], se3_exp(twists) @ good, beyond]))
+        verdicts = PossiblePoses(person).include(np.concatenate([good[None], se3_exp(twists) @ good, beyond]))
         np.testing.assert_array_equal(verdicts, [True] + 7 * [False])
 
 
 def test_nearest_finds_the_controls_again(people: list[Person]) -> None:
     controls = _controls(200) * [0.9, 0.95, 0.95]
     for person in people[:3]:
-        found, distance_mm = person.nearest(person.pose(*controls.T))
+        found, distance_mm = PossiblePoses(person).nearest(person.pose(*controls.T))
         assert distance_mm.max() < 1e-2
         np.testing.assert_allclose(person.pose(*found.T), person.pose(*controls.T), atol=2e-2)
 
 
 def test_unbounded_nearest_is_never_further_than_bounded(people: list[Person]) -> None:
     T = people[0].pose(np.array([1.08, 0.2]), np.array([0.0, 1.3]), np.array([0.0, 0.0]))
-    bounded, free = people[0].nearest(T)[1], people[0].nearest(T, bounded=False)[1]
+    possible = PossiblePoses(people[0])
+    bounded, free = possible.nearest(T)[1], possible.nearest(T, bounded=False)[1]
     assert (free < 0.05).all() and (bounded > 0.5).all()
 
 
 def test_competing_envelope_refuses_the_corner_of_the_box() -> None:
     box, competing = Person(5), Person(5, envelope="competing")
     corner = box.pose(0.1, 0.95, 0.95)
-    assert box.is_valid(corner) and not competing.is_valid(corner)
+    assert PossiblePoses(box).include(corner) and not PossiblePoses(competing).include(corner)
     take = record(competing, 400, 3)
     size = np.abs(take.controls[:, 1]) ** 1.3 + np.maximum(take.controls[:, 2], 0) ** 1.3
     assert size.max() < 1 + 1e-9
