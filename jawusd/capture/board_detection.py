@@ -15,7 +15,7 @@ from jawusd.base.arrays import Array
 from jawusd.base.errors import CalibrationError, CaptureError
 from jawusd.formats.capture import Boards
 from jawusd.formats.file_names import is_pattern, numbered_files
-from jawusd.media.pictures import read_header, read_picture, read_stored
+from jawusd.media.pictures import read_gray, read_header, read_stored
 from jawusd.media.pixels import to_display
 from jawusd.media.video import Video
 
@@ -300,9 +300,9 @@ class BoardClip:
 
 
 def _read(path: Path) -> NDArray[np.uint8]:
-    image = read_picture(path, cv2.IMREAD_GRAYSCALE)
+    image = read_gray(path)
     if image is not None:
-        return np.asarray(image, np.uint8)
+        return image
     try:  # OpenCV does not read EXR and DPX
         stored = read_stored(path)
     except CaptureError as error:

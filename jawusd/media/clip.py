@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from jawusd.base.arrays import Array
 from jawusd.base.errors import CaptureError
-from jawusd.media.pixels import Colour, ColourPicture, Slices
+from jawusd.media.pixels import Colour, ColourPicture
 
 
 class Timeline:
@@ -103,44 +103,24 @@ class VideoFrame:
 
 
 class Clip(ABC):
-    """A video or image sequence. No file stays open, so threads may share a clip.
+    """A video or image sequence. No file stays open, so threads may share a clip."""
 
-    Attributes:
-        path: the video file, or the pattern of the image files.
-        count: number of images.
-        times_s: increasing presentation times relative to the first image [s], shape (count,).
-        timeline: maps frames to images.
-        keys: indices of key frames, shape (n,).
-        start_s: presentation time of the file's first image, on the same clock as its sound [s].
-        fps: average number of images per second.
-        rotation_deg: counter-clockwise rotation stored in the file: 0, 90, 180 or 270. It is applied to every image.
-        size_px: (width, height) after rotation.
-        pixel_aspect: width of a pixel divided by its height, after rotation, as stated in the file; images are not
-            resampled.
-        timecode: time code of the first image, as HH:MM:SS:FF; "" if there is none.
-        timecode_fps: frame rate of the time code [Hz]; None if unknown.
-        is_interlaced: whether any image decoded so far was marked as interlaced.
-        has_alpha: whether the images have an alpha channel.
-        is_gray: whether the images are stored as one channel.
-        is_rgb: whether the images are stored as RGB.
-    """
-
-    path: Path
-    count: int
-    times_s: Array
-    timeline: Timeline
-    keys: NDArray[np.intp]
-    start_s: float
-    fps: float
-    rotation_deg: int
-    size_px: tuple[int, int]
-    pixel_aspect: float
-    timecode: str
-    timecode_fps: float | None = None
-    is_interlaced: bool = False
-    has_alpha: bool
-    is_gray: bool
-    is_rgb: bool
+    path: Path  # the video file, or the pattern of the image files
+    count: int  # number of images
+    times_s: Array  # increasing presentation times relative to the first image [s], shape (count,)
+    timeline: Timeline  # maps frames to images
+    keys: NDArray[np.intp]  # indices of key frames, shape (n,)
+    start_s: float  # presentation time of the file's first image, on the same clock as its sound [s]
+    fps: float  # average number of images per second
+    rotation_deg: int  # counter-clockwise rotation stored in the file, 0, 90, 180 or 270, applied to every image
+    size_px: tuple[int, int]  # (width, height) after rotation
+    pixel_aspect: float  # stated width of a pixel divided by its height, after rotation; images are not resampled
+    timecode: str  # time code of the first image, as HH:MM:SS:FF; "" if there is none
+    timecode_fps: float | None = None  # frame rate of the time code [Hz]; None if unknown
+    is_interlaced: bool = False  # whether any image decoded so far was marked as interlaced
+    has_alpha: bool  # whether the images have an alpha channel
+    is_gray: bool  # whether the images are stored as one channel
+    is_rgb: bool  # whether the images are stored as RGB
 
     def frames(
         self,
@@ -148,43 +128,24 @@ class Clip(ABC):
         last: int | None = None,
         *,
         colour: Colour = "gray",
-        region: tuple[int, int, int, int] | None = None,
         threads: int = 0,
     ) -> Iterator[VideoFrame]:
-        """Return an iterator over the images with indices first to last - 1.
+        """Return an iterator over the images with indices first to last - 1; by default, to the end of the clip.
 
         Gray images are the luma at full range (black 0, white 255); for gray and full-range files, they are the
-        decoder's own buffer, without a copy.
-
-        Args:
-            first: number of the first image.
-            last: one past the number of the last image; None for the end of the clip.
-            colour: format of the images.
-            region: (x0, y0, x1, y1) [px], x1 and y1 exclusive, in the rotated image; None for the whole image.
-            threads: decoder threads; 0 lets the codec choose.
+        decoder's own buffer, without a copy. With 0 decoder threads, the codec chooses their number.
 
         Raises:
             CaptureError: an image lies outside the file or cannot be decoded.
-            ValueError: the region is empty or outside the image.
         """
         last = self.count if last is None else last
         self._check_range(first, last)
-        width, height = self.size_px
-        x0, y0, x1, y1 = region or (0, 0, width, height)
-        if not (0 <= x0 < x1 <= width and 0 <= y0 < y1 <= height):
-            raise ValueError(f"region {region} is not inside the image of {width} x {height} px")
-        window = (slice(y0, y1), slice(x0, x1))
-        return self._converted(first, last, colour, window, threads)
+        return self._converted(first, last, colour, threads)
 
     def pictures(
         self, wanted: Sequence[int | None], *, colour: Colour = "gray", threads: int = 0
     ) -> Iterator[NDArray[np.uint8] | None]:
-        """Yield the image at each wanted index, and None where the index is None; no image is decoded twice.
-
-        Args:
-            wanted: increasing indices of images, or None.
-            colour: format of the images.
-            threads: decoder threads; 0 lets the codec choose.
+        """Yield the image at each of the increasing indices, None for None; no image is decoded twice; see `frames`.
 
         Raises:
             CaptureError: an image lies outside the file or cannot be decoded.
@@ -211,5 +172,5 @@ class Clip(ABC):
             )
 
     @abstractmethod
-    def _converted(self, first: int, last: int, colour: Colour, window: Slices, threads: int) -> Iterator[VideoFrame]:
+    def _converted(self, first: int, last: int, colour: Colour, threads: int) -> Iterator[VideoFrame]:
         """Yield the images with indices first to last - 1."""

@@ -15,8 +15,7 @@ from jawusd.base.inputs import check_input
 
 #: Maximum number of pixels of an image, four times 8K; a small header can declare an image that exhausts memory.
 MOST_PX = 1 << 27
-#  Self-contained file formats; playlists (HLS, DASH, concat, SDP) are excluded since they refer to other files and
-# URLs.
+# Self-contained file formats; playlists (HLS, DASH, concat, SDP) are excluded: they refer to other files and URLs.
 FORMATS = (
     "mov,mp4,m4a,3gp,3g2,mj2", "matroska,webm", "avi", "mpegts", "mpeg", "mpegvideo", "mxf", "flv", "ogg", "asf", "nut",
     "ivf", "dv", "h264", "hevc", "av1", "obu", "m4v", "mjpeg", "yuv4mpegpipe", "gif", "apng", "rm", "gxf", "wtv", "y4m",

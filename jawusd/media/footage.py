@@ -15,12 +15,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from jawusd.base.errors import CaptureError
+from jawusd.base.errors import CaptureError, naming_file
 from jawusd.formats.clips import ClipSource
 from jawusd.formats.file_names import is_pattern, numbered_files
 from jawusd.media.clip import Clip, Timeline, VideoFrame
 from jawusd.media.pictures import StoredPicture, read_header, read_stored
-from jawusd.media.pixels import Colour, Slices, coloured, to_display
+from jawusd.media.pixels import Colour, coloured, to_display
 from jawusd.media.video import Video
 
 #: Frame rate [Hz] if neither the capture nor the files state one.
@@ -60,7 +60,7 @@ class PictureSequence(Clip):
         self.timecode_fps = self.fps / math.ceil(self.fps / _FASTEST_COUNT - 0.01)
         self.pixel_aspect = header.pixel_aspect
         self._space = source.colour_space or header.colour_space
-        first = self._stored(0)
+        first = read_stored(self._files[0][1])
         height, width = first.pixels.shape[:2]
         self.size_px = (width, height)
         self.is_fractional = first.pixels.dtype.kind == "f"
@@ -72,7 +72,7 @@ class PictureSequence(Clip):
         Raises:
             CaptureError: the image cannot be read, or differs in size from the first image.
         """
-        found = self._stored(index)
+        found = read_stored(self._files[index][1])
         if found.pixels.shape[1::-1] != self.size_px:
             height, width = found.pixels.shape[:2]
             raise CaptureError(
@@ -90,19 +90,16 @@ class PictureSequence(Clip):
         pixels = np.asarray(self.stored(index).pixels, np.float32)
         return pixels if pixels.ndim == 3 else np.repeat(pixels[..., None], 3, axis=2)
 
-    def _stored(self, index: int) -> StoredPicture:
-        return read_stored(self._files[index][1])
-
-    def _converted(self, first: int, last: int, colour: Colour, window: Slices, threads: int) -> Iterator[VideoFrame]:
+    def _converted(self, first: int, last: int, colour: Colour, threads: int) -> Iterator[VideoFrame]:
         if threads == 1 or last - first < 2:
             for index in range(first, last):
-                yield self._frame(index, colour, window)
+                yield self._frame(index, colour)
             return
         waiting: deque[Future[VideoFrame]] = deque()
         with ThreadPoolExecutor(max_workers=_AHEAD) as pool:
             try:
                 for index in range(first, last):
-                    waiting.append(pool.submit(self._frame, index, colour, window))
+                    waiting.append(pool.submit(self._frame, index, colour))
                     if len(waiting) > _AHEAD:
                         yield waiting.popleft().result()
                 while waiting:
@@ -110,13 +107,10 @@ class PictureSequence(Clip):
             finally:
                 pool.shutdown(wait=False, cancel_futures=True)
 
-    def _frame(self, index: int, colour: Colour, window: Slices) -> VideoFrame:
+    def _frame(self, index: int, colour: Colour) -> VideoFrame:
         stored = self.stored(index)
-        try:
-            shown = to_display(stored.pixels[window], stored.largest, self._space, self._source.colour_config)
-        except CaptureError as error:
-            error.path = error.path or str(self.path)
-            raise
+        with naming_file(self.path):
+            shown = to_display(stored.pixels, stored.largest, self._space, self._source.colour_config)
         image = coloured(shown, colour)
         image.flags.writeable = False
         return VideoFrame(index, float(self.times_s[index]), image)

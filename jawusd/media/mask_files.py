@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
-import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -21,7 +19,6 @@ from jawusd.media.pixels import Colour
 #: Gray value of the requested arch and gray value of the other arch in label images; all other pixels must be 0.
 LabelValues = tuple[int, int]
 
-_NUMBER = re.compile(r"%(0(\d+))?d")
 _FEW = 6  # maximum number of label values that a message lists
 
 
@@ -40,12 +37,10 @@ class PngMasks:
         labels: LabelValues | None = None,
         is_other: Callable[[RawImage], bool] | None = None,
     ) -> None:
-        """Find the files of a pattern with one %d or %06d.
+        """Find the files of a pattern; see `numbered_files`.
 
         Args:
-            pattern: path of the files, with the number as %d or %06d.
             size_px: (width, height) of all files, if known.
-            labels: see `LabelValues`.
             is_other: detects images that are not masks; these are not used to find the levels.
 
         Raises:
@@ -54,37 +49,13 @@ class PngMasks:
         self._pattern, self._size_px, self._labels, self._is_other = pattern, size_px, labels, is_other
         self.odd: dict[int, str] = {}
         # File names take less memory than paths; hours of footage from several cameras give a hundred thousand files.
-        self._names = self._found(pattern) if "%" in pattern.name else _names(numbered_files(pattern))
+        self._names = {number: path.name for number, path in numbered_files(pattern).items()}
         self.count = max(self._names) + 1
 
     @property
     def numbers(self) -> set[int]:
         """Return the numbers of the files."""
         return set(self._names)
-
-    @staticmethod
-    def _found(pattern: Path) -> dict[int, str]:
-        number = _NUMBER.search(pattern.name)
-        if number is None or pattern.name.count("%") != 1:
-            raise CaptureError(
-                "the mask pattern must contain one number such as %06d.",
-                path=pattern,
-                hint="Correct it in capture.toml.",
-            )
-        if not pattern.parent.is_dir():
-            raise CaptureError(
-                f"there is no folder {pattern.parent}.", path=pattern, hint="Correct it in capture.toml."
-            )
-        digits = rf"\d{{{number[2]},}}" if number[2] else r"\d+"
-        before, after = (re.escape(part) for part in (pattern.name[: number.start()], pattern.name[number.end() :]))
-        name = re.compile(f"{before}({digits}){after}")
-        found = (name.fullmatch(entry.name) for entry in os.scandir(pattern.parent))
-        names = {int(match[1]): match[0] for match in found if match}
-        if not names:
-            raise CaptureError(
-                "no file in the folder matches this pattern.", path=pattern, hint="Correct `masks` in capture.toml."
-            )
-        return names
 
     @cached_property
     def levels(self) -> SourceLevels:
@@ -192,17 +163,11 @@ class VideoMasks:
 
 @dataclass(frozen=True, eq=False)
 class OneMask:
-    """A mask in memory, of one frame.
+    """A mask in memory, of one frame."""
 
-    Attributes:
-        frame: frame number of the camera.
-        image: 255 for tooth, 0 for background, shape (h, w).
-        odd: reasons why images were rejected; always empty.
-    """
-
-    frame: int
-    image: MaskImage
-    odd: dict[int, str] = field(default_factory=dict)
+    frame: int  # frame number of the camera
+    image: MaskImage  # 255 for tooth, 0 for background, shape (h, w)
+    odd: dict[int, str] = field(default_factory=dict)  # reasons why images were rejected; always empty
 
     @property
     def count(self) -> int:
@@ -212,10 +177,6 @@ class OneMask:
     def masks(self, first: int) -> Iterator[MaskImage | None]:
         """Yield the masks from a frame number on, (h, w) uint8, or None for other frames."""
         return (self.image if frame == self.frame else None for frame in range(first, self.count))
-
-
-def _names(files: Mapping[int, Path]) -> dict[int, str]:
-    return {number: path.name for number, path in files.items()}
 
 
 def _check_size(path: Path, found: tuple[int, int], allowed: tuple[int, int]) -> None:

@@ -103,26 +103,25 @@ def _png_levels_of_version(
     is_other: Callable[[RawImage], bool] | None,
 ) -> SourceLevels:
     """Find the levels of files; modification times and sizes of the sampled files identify the version."""
+    read: list[Path] = []
+    sizes: dict[tuple[int, int], Path] = {}
+
+    def pictures(paths: Sequence[Path], as_numbers: bool) -> Iterator[RawImage]:
+        for path in paths:
+            try:
+                image = load_png(path)
+            except CaptureError:
+                continue  # an error is raised later, when the frame is read
+            if is_other is None or not is_other(image):
+                read.append(path)
+                sizes.setdefault((image.shape[1], image.shape[0]), path)
+                yield read_palette_numbers(path, image) if as_numbers else image
+
     for palette_numbers in (False, True) if any(map(has_palette, sample)) else (False,):
-        read: list[Path] = []
-        sizes: dict[tuple[int, int], Path] = {}
-
-        def pictures(
-            paths: Sequence[Path], as_numbers: bool, read: list[Path], sizes: dict[tuple[int, int], Path]
-        ) -> Iterator[RawImage]:
-            for path in paths:
-                try:
-                    image = load_png(path)
-                except CaptureError:
-                    continue  # an error is raised later, when the frame is read
-                if is_other is None or not is_other(image):
-                    read.append(path)
-                    sizes.setdefault((image.shape[1], image.shape[0]), path)
-                    yield read_palette_numbers(path, image) if as_numbers else image
-
-        more = partial(pictures, others.files, palette_numbers, read, sizes)
+        read.clear()
+        more = partial(pictures, others.files, palette_numbers)
         try:
-            found = find_levels(pictures(sample, palette_numbers, read, sizes), False, more)
+            found = find_levels(pictures(sample, palette_numbers), False, more)
         except NotMasks as error:
             where = read[error.index] if error.index is not None else sample[0].parent
             raise CaptureError(error.reason, path=where, hint=error.hint) from error

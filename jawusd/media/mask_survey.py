@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
 from jawusd.base.arrays import Array
@@ -176,7 +175,7 @@ def sample_masks(source: CameraSource, size_px: tuple[int, int], files: ExitStac
 def _first_last(reader: MaskReader) -> tuple[int, int] | None:
     """Return the first and last frame with a mask, assuming no gaps between them, or None."""
     spread = np.unique(np.linspace(0, reader.count - 1, _SPREAD).round().astype(int)).tolist()
-    shown = [frame for frame in spread if _shows(reader, frame)]
+    shown = [frame for frame in spread if reader.read(frame) is not None]
     if not shown:
         return None
     before = max((frame for frame in spread if frame < shown[0]), default=-1)
@@ -188,13 +187,8 @@ def _boundary(reader: MaskReader, shown: int, empty: int) -> int:
     """Return the frame at which masks begin or end, found by bisection between a masked and an empty frame."""
     while abs(shown - empty) > 1:
         middle = (shown + empty) // 2
-        if _shows(reader, middle):
+        if reader.read(middle) is not None:
             shown = middle
         else:
             empty = middle
     return shown
-
-
-def _shows(reader: MaskReader, frame: int) -> bool:
-    mask = reader.read(frame)
-    return mask is not None and cv2.countNonZero(mask) > 0

@@ -28,17 +28,11 @@ _AHEAD = 4  # number of buffered images; the buffer takes 8 MB per reader for fu
 
 @dataclass(frozen=True, eq=False)
 class FrameMasks:
-    """Masks of both arches in one frame of a camera, which are in memory.
+    """Masks of both arches in one frame of a camera, in memory."""
 
-    Attributes:
-        name: name of the camera.
-        frame: frame number of the camera.
-        masks: upper and lower arch: 255 for tooth, 0 for background, shape (2, h, w).
-    """
-
-    name: str
-    frame: int
-    masks: MaskImage
+    name: str  # name of the camera
+    frame: int  # frame number of the camera
+    masks: MaskImage  # upper and lower arch: 255 for tooth, 0 for background, shape (2, h, w)
 
 
 class MaskReader:
@@ -88,7 +82,6 @@ class MaskReader:
         else:
             self._source = pictures = VideoMasks(path, size_px, labels)
             self._timeline = _timeline_of_video(path, pictures, timeline)
-        self._place = _place_of(self._timeline, self._source)
         self.count = self._source.count if self._timeline is None else self._timeline.count
         if not (labels or isinstance(self._source, OneMask)):
             self.levels = self._source.levels.levels
@@ -176,9 +169,11 @@ class MaskReader:
         if self._timeline is None:
             yield from self._source.masks(first)
             return
+        # PNG files are numbered like the files of the clip, images of a mask video like the images of the clip.
+        numbered = self._timeline.number if isinstance(self._source, PngMasks) else self._timeline.picture
         pictures, at = None, 0
         for frame in range(first, self.count):
-            picture = self._place(frame)
+            picture = numbered(frame)
             if picture is None or picture >= self._source.count:
                 yield None
                 continue
@@ -213,13 +208,6 @@ def _timeline_of_pngs(path: Path, source: PngMasks, video: Timeline | None) -> T
             "before making masks.",
         )
     return video
-
-
-def _place_of(timeline: Timeline | None, source: PngMasks | VideoMasks | OneMask) -> Callable[[int], int | None]:
-    """Return the function that maps frames to the numbers of masks in the mask source."""
-    if timeline is None:
-        return lambda frame: frame
-    return timeline.number if isinstance(source, PngMasks) else timeline.picture
 
 
 def _timeline_of_video(path: Path, source: VideoMasks, video: Timeline | None) -> Timeline:

@@ -27,9 +27,7 @@ RawPicture = NDArray[np.uint8] | NDArray[np.uint16]
 _PNG = b"\x89PNG\r\n\x1a\n"
 _HINT = "Export the images again, as PNG, TIFF, EXR, DPX or JPEG."
 _MOST_HEADER_BYTES = 1 << 16
-#  Maximum number of pixels of an image, 8K; small files can declare images that exhaust memory, and decoding takes up
-# to
-#: 28 bytes per pixel.
+#: Maximum number of pixels of an image, 8K: decoding takes up to 28 bytes per pixel that a small file declares.
 MOST_STORED_PX = 36_000_000
 _EXR, _DPX = b"\x76\x2f\x31\x01", (b"SDPX", b"XPDS")
 _QUARTERS, _MIRRORED = {3: 2, 6: 3, 8: 1}, (2, 4, 5, 7)  # quarter turns by Exif orientation, and mirrored orientations
@@ -148,15 +146,11 @@ def _stored_pixels(frame: av.VideoFrame) -> tuple[Stored, int]:
     if bits <= 8:
         return frame.to_ndarray(format="gray" if name == "gray" else "rgb24", interpolation=TO_RGB), 255
     if name.startswith("gray"):
-        return _gray(frame, bits), (1 << bits) - 1
+        wide = frame if bits == 16 else frame.reformat(format=f"gray{bits}le")
+        return np.asarray(wide.to_ndarray(), np.uint16), (1 << bits) - 1
     if frame.format.is_rgb:
         return frame.to_ndarray(format="rgb48le"), 65535
     return frame.to_ndarray(format="rgb24", interpolation=TO_RGB), 255
-
-
-def _gray(frame: av.VideoFrame, bits: int) -> NDArray[np.uint16]:
-    wide = frame if bits == 16 else frame.reformat(format=f"gray{bits}le")
-    return np.asarray(wide.to_ndarray(), np.uint16)
 
 
 def _fractions(frame: av.VideoFrame) -> NDArray[np.float16] | NDArray[np.float32]:

@@ -208,9 +208,9 @@ ColourPicture: TypeAlias = "NDArray[np.uint8] | DecodedPicture"
 
 
 def converted(frame: av.VideoFrame, colour: Colour, rotation_deg: int, window: Slices) -> NDArray[np.uint8]:
-    """Return a window of a decoded image after rotation, shape (h, w), (h, w, 3) or (h, w, 4)."""
+    """Return a window of a decoded image after rotation, (h, w, 3) or (h, w, 4); the whole image (h, w) if gray."""
     if colour == "gray":
-        return _gray(frame, rotation_deg, window)
+        return _gray(frame, rotation_deg)
     part, inside = _around(frame, _stored_window(frame, rotation_deg, window))
     pixels: NDArray[np.uint8]
     if colour == "rgb" and max(one.bits for one in frame.format.components) > _BYTE_BITS:
@@ -282,19 +282,19 @@ def deep_rgb(frame: av.VideoFrame) -> tuple[NDArray[np.uint16], int]:
     return stored, ((1 << bits) - 1) << (16 - bits) if full else 255 << 8
 
 
-def _gray(frame: av.VideoFrame, rotation_deg: int, window: Slices) -> NDArray[np.uint8]:
+def _gray(frame: av.VideoFrame, rotation_deg: int) -> NDArray[np.uint8]:
     name = frame.format.name
     deep = _DEEP.fullmatch(name)
     if deep is not None:
         # FFmpeg's conversion to gray mixes in chroma, which causes errors of up to 11 of 255 levels.
         plane = frame.planes[0]
         stored = np.frombuffer(memoryview(plane), "<u2").reshape(-1, plane.line_size // 2)
-        luma = np.rot90(stored[: frame.height, : frame.width], rotation_deg // 90)[window]
+        luma = np.rot90(stored[: frame.height, : frame.width], rotation_deg // 90)
         return _deep_table(int(deep[2]), deep[1] == "p0", frame.color_range == _FULL_RANGE)[luma]
     full = name in _PLANAR_FULL_RANGE or (name in _PLANAR_VIDEO_RANGE and frame.color_range == _FULL_RANGE)
     if not full and name not in _PLANAR_VIDEO_RANGE:
         frame = frame.reformat(format="gray")
-    image = np.rot90(_plane(frame.planes[0]), rotation_deg // 90)[window]
+    image = np.rot90(_plane(frame.planes[0]), rotation_deg // 90)
     if name in _PLANAR_VIDEO_RANGE and not full:
         return np.asarray(cv2.LUT(np.ascontiguousarray(image), _STRETCH), np.uint8)
     return image

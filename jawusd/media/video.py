@@ -7,6 +7,7 @@ identified by its time stamp, so that B-frames, edit lists and variable rates ca
 
 from __future__ import annotations
 
+import contextlib
 import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -24,7 +25,6 @@ from jawusd.media.pixels import (
     Colour,
     ColourPicture,
     DecodedPicture,
-    Slices,
     coloured,
     converted,
     deep_rgb,
@@ -124,17 +124,18 @@ class Video(Clip):
                 frame = next(frame for index, frame in decoded if index == number)
                 yield DecodedPicture(frame, self.rotation_deg)
 
-    def _converted(self, first: int, last: int, colour: Colour, window: Slices, threads: int) -> Iterator[VideoFrame]:
+    def _converted(self, first: int, last: int, colour: Colour, threads: int) -> Iterator[VideoFrame]:
         for index, frame in self._decode(first, last, threads, alpha=colour == "rgba"):
-            image = self._image(frame, colour, window)
+            image = self._image(frame, colour)
             image.flags.writeable = False  # the gray buffer may be a reference image of the decoder, so it is read-only
             yield VideoFrame(index, float(self.times_s[index]), image)
 
-    def _image(self, frame: av.VideoFrame, colour: Colour, window: Slices) -> NDArray[np.uint8]:
+    def _image(self, frame: av.VideoFrame, colour: Colour) -> NDArray[np.uint8]:
         if self._space is None:
-            return converted(frame, colour, self.rotation_deg, window)
+            width, height = self.size_px
+            return converted(frame, colour, self.rotation_deg, (slice(0, height), slice(0, width)))
         stored, white = deep_rgb(frame)
-        turned = np.rot90(stored, self.rotation_deg // 90)[window]
+        turned = np.rot90(stored, self.rotation_deg // 90)
         return coloured(to_display(turned, white, self._space, self._config), colour)
 
     def _open(self) -> av.container.InputContainer:
@@ -143,20 +144,19 @@ class Video(Clip):
         except (av.FFmpegError, OSError) as error:
             said, hint = why_unreadable(self.path) or (f"the video cannot be opened ({error.strerror}).", _CUT_OFF)
             raise CaptureError(said, path=self.path, hint=hint) from error
-        if not container.streams.video:
-            container.close()
-            raise CaptureError("the file has no video stream.", path=self.path, hint="Check the path in capture.toml.")
-        context = container.streams.video[0].codec_context
-        if context is None:
-            container.close()
-            raise CaptureError("the video codec is not supported.", path=self.path, hint=_REENCODE)
-        if context.width * context.height > MOST_PX:
-            container.close()
-            raise CaptureError(
-                f"images are {context.width} x {context.height} px; at most {MOST_PX} px in total are allowed.",
-                path=self.path,
-                hint="Scale the video down.",
-            )
+        with contextlib.ExitStack() as stack:
+            stack.enter_context(container)
+            if not container.streams.video:
+                raise CaptureError(
+                    "the file has no video stream.", path=self.path, hint="Check the path in capture.toml."
+                )
+            context = container.streams.video[0].codec_context
+            if context is None:
+                raise CaptureError("the video codec is not supported.", path=self.path, hint=_REENCODE)
+            if context.width * context.height > MOST_PX:
+                found = f"images are {context.width} x {context.height} px; at most {MOST_PX} px in total are allowed."
+                raise CaptureError(found, path=self.path, hint="Scale the video down.")
+            stack.pop_all()
         return container
 
     def _packet_table(
@@ -182,9 +182,7 @@ class Video(Clip):
                     dts.append(packet.pts if packet.dts is None else packet.dts)
                     key.append(packet.is_keyframe)
         except av.FFmpegError:
-            # The file is truncated; use the images before the truncation. Callers compare their number with
-            # `announced`.
-            pass
+            pass  # a truncated file: use the images before the truncation; `announced` reveals it
         order = np.argsort(pts, kind="stable")
         times = np.array(pts, np.int64)[order]
         is_key = np.array(key, bool)[order]

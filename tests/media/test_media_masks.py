@@ -155,8 +155,8 @@ def test_sources_that_are_not_there(tmp_path: Path, pattern: Path, video: Path) 
     for path, message in {
         tmp_path / "gone" / "%06d.png": "there is no folder .*gone",
         pattern.parent / "mask_%06d.png": "no file in the folder",
-        pattern.parent / "%06d_%02d.png": "one number",
-        pattern.parent / "%s.png": "one number",
+        pattern.parent / "%06d_%02d.png": "two numbers",
+        pattern.parent / "%s.png": "needs a number",
         tmp_path / "gone.mkv": "no such video",
     }.items():
         with pytest.raises(CaptureError, match=message):

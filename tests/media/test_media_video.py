@@ -115,15 +115,6 @@ def test_dense_key_frames_do_not_confuse_seeking(tmp_path: Path) -> None:
         assert np.array_equal(next(video.frames(first)).image, expected[first])
 
 
-def test_region_is_the_part_of_the_whole(variable: tuple[Path, list[int]]) -> None:
-    video = Video(variable[0])
-    whole = next(video.frames(5)).image
-    assert np.array_equal(next(video.frames(5, region=(11, 7, 50, 33))).image, whole[7:33, 11:50])
-    for bad in ((0, 0, 97, 10), (5, 5, 5, 9), (-1, 0, 4, 4)):
-        with pytest.raises(ValueError, match="region"):
-            video.frames(region=bad)
-
-
 @pytest.mark.parametrize("rotation", [90, -90, 180])
 def test_rotation_is_honoured_as_opencv_does(tmp_path: Path, rotation: int) -> None:
     path = tmp_path / "turned.mp4"
@@ -136,7 +127,6 @@ def test_rotation_is_honoured_as_opencv_does(tmp_path: Path, rotation: int) -> N
     assert len(found) == len(expected) == 10
     for frame, image in zip(found, expected, strict=True):
         assert np.abs(frame.image.astype(int) - image).mean() < 1.5
-    assert np.array_equal(next(video.frames(3, region=(5, 9, 40, 50))).image, found[3].image[9:50, 5:40])
     assert next(video.frames(colour="rgb")).image.shape[:2] == expected[0].shape
 
 
