@@ -21,8 +21,8 @@ from jawusd.media.pixels import Colour, ColourPicture
 class Timeline:
     """Assignment of the images of a video to a regular grid of frames by presentation time.
 
-    Frame k is the image that is displayed k nominal frame durations after the first image. At a constant rate this is
-    image k; at a variable rate, some frames have no image.
+    Frame k is the image that is displayed k nominal frame durations after the first image; some frames may have no
+    image.
 
     Attributes:
         numbers: frame number of each image, increasing, shape (n,).

@@ -106,14 +106,11 @@ def picture_changes(pictures: Iterable[NDArray[np.uint8]]) -> Array:
 
 
 def repeated_runs(changes: Array) -> list[tuple[int, int]]:
-    """Return the indices of the first and last image of each run of images that repeat the previous image.
+    """Return the first and last index of each run of repeated images, from `picture_changes` (n,).
 
-    Encoders also repeat images of static scenes, but the changes then fade out and in. In a freeze they stop and
-    resume abruptly, and after one or two repeated images the next change is larger than usual. If instead the change
-    before the run is larger, a light was switched off. Scenes that hardly change are skipped.
-
-    Args:
-        changes: result of `picture_changes`, shape (n,).
+    Encoders also repeat images of static scenes, but the changes then fade out and in; in a freeze they stop and resume
+    abruptly. After one or two repeated images, the next change must be larger than usual, and larger than the one
+    before the run (otherwise a light was switched off). Scenes that hardly change are skipped.
     """
     known = changes[1:]
     if len(known) < _FEWEST:
@@ -155,13 +152,7 @@ def _stands_out(changes: Array, first: int, last: int) -> bool:
 
 
 def rate_findings(videos: Mapping[str, Clip], fps: float, path: str) -> Iterator[Finding]:
-    """Compare the frame rates of clips with the capture's frame rate [Hz] and with one another.
-
-    Args:
-        videos: clips by camera.
-        fps: frame rate stated in the capture.
-        path: path of the capture, named in the findings.
-    """
+    """Compare the frame rates of clips by camera with the rate [Hz] in the capture at `path`, and with one another."""
     for name, video in videos.items():
         rate = video.timeline.rate
         if abs(rate / fps - 1.0) > _RATE_TOLERANCE:

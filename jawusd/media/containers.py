@@ -46,7 +46,7 @@ def open_container(
     Decoders raise errors for damaged images or mark them as corrupt, and reject images of more than `most_px` pixels.
 
     Raises:
-        av.FFmpegError: the file is in a format that is not allowed, or refers to other files.
+        av.FFmpegError: the format is not allowed, or the file refers to other files.
         OSError: the file cannot be read.
     """
     limit = {"max_pixels": str(most_px)}

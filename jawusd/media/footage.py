@@ -146,8 +146,7 @@ def open_clip(source: ClipSource | Path) -> Clip:
 class FrameReader:
     """Random access to the images of one video; thread-safe.
 
-    The decoder stays at the last image, so that reading the next one is fast. Recent images are cached. For other
-    images, the reader seeks to the previous key frame.
+    The decoder stays at the last image, so that reading the next one is fast; recent images are cached.
     """
 
     def __init__(self, video: Clip) -> None:

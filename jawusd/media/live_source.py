@@ -49,11 +49,10 @@ class LiveSource:
     """Reader of one live camera, in its own thread, with a buffer of the most recent images."""
 
     def __init__(self, where: str, size_px: tuple[int, int], early_s: float = 0.0) -> None:
-        """Prepare to read images from an address.
+        """Prepare to read images of a calibrated size (width, height).
 
         Args:
             where: a file, a URL (rtsp://, http://, ...), or a device (/dev/video0 on Linux).
-            size_px: width and height for which the camera was calibrated.
             early_s: time by which the recording in a file begins before those of the other sources [s].
         """
         self.where, self._size_px, self._early_s = where, size_px, early_s

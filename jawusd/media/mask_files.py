@@ -71,7 +71,7 @@ class PngMasks:
         return found
 
     def masks(self, first: int) -> Iterator[MaskImage | None]:
-        """Yield the masks from a number on, (h, w) uint8, or None if there is no file or nothing is segmented.
+        """Yield the masks from a number on, (h, w), or None if there is no file or nothing is segmented.
 
         Raises:
             CaptureError: a file cannot be decoded or has the wrong size, or the images are not masks.
@@ -115,7 +115,7 @@ class PngMasks:
 
 
 class VideoMasks:
-    """Masks stored as a video: its black-and-white images, or its alpha channel.
+    """Masks stored as a video, black and white or in its alpha channel.
 
     Attributes:
         count: number of images.
@@ -140,7 +140,7 @@ class VideoMasks:
         return video_levels(self._video.path)[0]
 
     def masks(self, first: int) -> Iterator[MaskImage | None]:
-        """Yield the masks from an image number on, (h, w) uint8, or None if nothing is segmented.
+        """Yield the masks from an image number on, (h, w), or None if nothing is segmented.
 
         Raises:
             CaptureError: an image cannot be decoded, or the images are not masks.

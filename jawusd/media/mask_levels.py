@@ -65,8 +65,8 @@ class MaskLevels:
     def coverage(self, image: RawImage) -> tuple[MaskImage | None, str]:
         """Return the mask of an image (0 to 255, outline at half), or None; and the reason why it is rejected.
 
-        The reason is a predicate whose subject is the image; it is empty for masks and empty images. The mask may be
-        the input array itself.
+        The reason is a predicate whose subject is the image, "" for masks and empty images. The mask may be the input
+        itself.
         """
         if (image.dtype == np.uint16) != self.deep:
             return None, f"has {8 * image.dtype.itemsize} bits per channel, unlike other images"
@@ -204,8 +204,7 @@ def find_levels(pictures: Iterable[RawImage], lossy: bool, more: Callable[[], It
 
     Args:
         pictures: images sampled from the whole take.
-        lossy: whether the images are coded with losses.
-        more: returns all images that were not sampled; called if the samples are empty.
+        more: returns all other images; called if the samples are empty.
 
     Raises:
         NotMasks: most of the non-empty images are not masks, or have more than two levels.

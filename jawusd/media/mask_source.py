@@ -25,8 +25,8 @@ _NEUTRAL = 12  # maximum difference [of 255] between the channels of a gray imag
 class SourceLevels:
     """Meaning of the pixel values of one mask source.
 
-    `levels` is None if all images are empty. `palette_numbers` is true if palette indices are used because all palette
-    colours are equal. `sizes_px` lists the sizes (width, height) of the sampled files, with one file for each size.
+    `palette_numbers` is true if palette indices are used because all palette colours are equal. `sizes_px` has one of
+    the sampled files for each size (width, height).
     """
 
     levels: MaskLevels | None

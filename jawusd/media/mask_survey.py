@@ -22,15 +22,15 @@ _HALF = 128
 
 
 def survey_masks(source: CameraSource, size_px: tuple[int, int]) -> list[Finding]:
-    """Return findings about the masks of one camera, from samples of the whole take.
+    """Return findings about the masks of one camera with images (width, height), from samples of the whole take.
 
-    `size_px` is the (width, height) of the camera's images. Kinds: "camera_without_masks" and "masks_black", warnings
-    about unused masks; "mask_levels", a note about values other than 0 and full white; "masks_soft", a warning that
-    the outline is ambiguous; "mask_polarity", a warning that it is ambiguous which level is teeth.
+    Kinds: "camera_without_masks" and "masks_black", warnings about unused masks; "mask_levels", a note about values
+    other than 0 and full white; "masks_soft", a warning that the outline is ambiguous; "mask_polarity", a warning that
+    it is ambiguous which level is teeth.
 
     Raises:
         CaptureError: the masks are missing or damaged, differ in size or number from the camera's images, or are not
-            masks; the message names the file and its content.
+            masks.
     """
     if source.masks is None:
         return [
@@ -155,12 +155,7 @@ class MaskSamples:
 
 
 def sample_masks(source: CameraSource, size_px: tuple[int, int], files: ExitStack) -> MaskSamples:
-    """Sample masks over a whole clip, and find the first and last frame with a mask.
-
-    Args:
-        source: a camera with masks.
-        size_px: (width, height) of the camera's images.
-        files: exit stack that closes the masks.
+    """Sample the masks of a camera over a whole clip with images (width, height); the exit stack closes the masks.
 
     Raises:
         CaptureError: masks are missing, damaged, of the wrong size, or not masks.

@@ -39,10 +39,8 @@ class MaskReader:
     """Reader of the masks of one arch in one camera.
 
     Sequential reads decode the next frames in a background thread; random access decodes on demand. A reader is not
-    thread-safe. Use it as a context manager or close it; otherwise its thread never ends.
-
-    Frames follow the camera's clock: frame k is shown k nominal frame durations after the camera's first image. In
-    videos with a variable frame rate, some frames have no image and therefore no mask.
+    thread-safe. Use it as a context manager or close it; otherwise its thread never ends. Frames are those of the
+    camera's `Timeline`.
 
     Attributes:
         count: one past the last frame number of the masks.
@@ -90,9 +88,7 @@ class MaskReader:
         self._ahead: _Ahead | None = None
 
     def read(self, frame: int) -> MaskImage | None:
-        """Return the prepared mask (h, w) of a frame: 255 for tooth, 0 for background, intermediate values at edges.
-
-        Return None if the frame is not segmented: outside the video, without an image, or with a black mask.
+        """Return the prepared mask (h, w) of a frame, 255 for tooth, 0 for background; None if nothing is segmented.
 
         Raises:
             CaptureError: the image cannot be decoded, has the wrong size, or is not a mask.

@@ -101,11 +101,8 @@ def tracking_sheet(
 ) -> NDArray[np.uint8]:
     """Return one RGB image of captioned tiles cropped to the teeth, with a row per frame and a column per camera.
 
-    A tile is gray if the camera has no image. Crowns are not tinted if the jaw was lost.
-
-    Args:
-        frames: frame numbers of the reference camera; all must be in the tracks.
-        backdrops: image sources by camera.
+    A tile is gray if the camera has no image. Crowns are not tinted if the jaw was lost. Frames are those of the
+    reference camera; `backdrops` has the image source of each camera.
 
     Raises:
         ValueError: a frame is not in tracks.
@@ -290,12 +287,11 @@ def label_sheet(
     T_anatomical_scan: Array,
     captions: Sequence[str],
 ) -> NDArray[np.uint8]:
-    """Return one RGB image with a row of four views for each scan.
+    """Return one RGB image with a captioned row of four views for each scan.
 
     Args:
         scans: for each scan: "upper" or "lower", the scan, and a label of `formats.mesh` for each vertex.
         T_anatomical_scan: transform from the scan frame to (left, up, front) axes, shape (4, 4).
-        captions: one line per scan, written above its row of views.
     """
     tiles = []
     for (arch, mesh, labels), caption in zip(scans, captions, strict=True):

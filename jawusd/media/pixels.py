@@ -38,8 +38,8 @@ def to_display(stored: Stored, largest: int, space: str | None, config: Path | N
     """Convert an image to a display-referred one, (h, w) or (h, w, 3) uint8, 0 to 255.
 
     Args:
-        stored: pixels as stored in the file: integers 0 to `largest`, or floating point.
-        largest: integer value of white: 255, 1023, 4095 or 65535.
+        stored: pixels as stored in the file: integers 0 to `largest` (white: 255, 1023, 4095 or 65535), or floating
+            point.
         space: colour space of the pixels; None for "display" (integers) or "linear" (floating point).
         config: OpenColorIO config that defines other colour spaces.
 
@@ -181,11 +181,7 @@ def _deep_table(bits: int, high: bool, full: bool) -> NDArray[np.uint8]:
 
 
 class DecodedPicture:
-    """Decoded image that is accessed like an array; accessed regions are converted to RGB.
-
-    Attributes:
-        shape: height, width, 3.
-    """
+    """Decoded image (height, width, 3), accessed like an array; only accessed regions are converted to RGB."""
 
     def __init__(self, frame: av.VideoFrame, rotation_deg: int) -> None:
         """Store a decoded image and the rotation that the file states."""
@@ -249,10 +245,7 @@ def _widened(part: slice[int, int, int], limit: int) -> tuple[int, int]:
 
 
 def _around(frame: av.VideoFrame, window: Slices) -> tuple[av.VideoFrame, Slices]:
-    """Return a crop of a stored image around a window, with a margin, and the position of the window in the crop.
-
-    If the crop would cover more than half of the image, the image is not cropped.
-    """
+    """Return an image or its crop around a window with a margin, whichever is faster, and the window in it."""
     rows, columns = window
     (top, bottom), (left, right) = (_widened(*sides) for sides in zip(window, (frame.height, frame.width)))
     height, width = bottom - top, right - left

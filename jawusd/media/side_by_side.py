@@ -50,11 +50,7 @@ Piece = tuple[str, Colour, bool]
 
 
 class CameraWall:
-    """Image of all cameras of a take side by side.
-
-    Attributes:
-        size_px: (width, height) of the images.
-    """
+    """Image of all cameras of a take side by side, of `size_px` (width, height)."""
 
     def __init__(
         self,
@@ -68,7 +64,6 @@ class CameraWall:
 
         Args:
             cameras: calibrated cameras; other cameras are shown without scans.
-            backdrops: image sources by camera.
             scans: teeth scans of the tracks, upper and lower [mm].
             tile_px: (width, height) of each camera's image.
         """
@@ -90,12 +85,9 @@ class CameraWall:
         fill: float,
         partly: Callable[[NDArray[np.uint8]], None] | None = None,
     ) -> NDArray[np.uint8]:
-        """Return the image of a frame of the reference camera, (h, w, 3) RGB.
+        """Return the image of a frame of the reference camera, (h, w, 3) RGB, with scans of opacity `fill`.
 
-        Args:
-            scans: scans to draw.
-            fill: opacity of the crowns.
-            partly: callback that receives incomplete images while cameras are decoded, if decoding takes long.
+        If decoding takes long, `partly` receives incomplete images.
 
         Raises:
             CaptureError: a camera's image cannot be decoded.
@@ -154,10 +146,7 @@ class _Cell:
 def _teeth_parts(
     cameras: Mapping[str, Camera], tracks: Tracks, meshes: Sequence[Mesh], aspect: float
 ) -> dict[str, Part]:
-    """Return the region of each camera's images that contains the teeth over a take, by camera name.
-
-    Regions have the given aspect ratio (width over height) where possible.
-    """
+    """Return the image region of the teeth over a take by camera, if possible with an aspect of width over height."""
     rows = np.unique(np.linspace(0, len(tracks.frames) - 1, _MOST_FRAMES).round().astype(int))
     moved = []
     for mesh, poses in zip(meshes, (tracks.T_world_upper, tracks.T_world_lower), strict=True):

@@ -52,11 +52,7 @@ class Video(Clip):
         colour_space: str | None = None,
         colour_config: Path | None = None,
     ) -> None:
-        """Read the table of images and decode the first one.
-
-        Args:
-            path: the file.
-            colour_space, colour_config: colour space of the images if they are not display-referred; see `pixels`.
+        """Read the table of images and decode the first one; see `pixels` for colour spaces.
 
         Raises:
             CaptureError: the file is missing, empty, truncated, not a video, or has no presentation times.
@@ -162,10 +158,7 @@ class Video(Clip):
     def _packet_table(
         self, container: av.container.InputContainer, stream: av.VideoStream
     ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.intp], int]:
-        """Return the time stamp of each image, and the decoding time and the index of its key frame.
-
-        The last return value is the number of stored images.
-        """
+        """Return each image's time stamp, its key frame's decoding time and index, and the number of stored images."""
         pts, dts, key, stored = [], [], [], 0
         may_have_checksums = stream.codec_context.name == "ffv1"
         try:
@@ -222,9 +215,8 @@ class Video(Clip):
     def _seek(self, container: av.container.InputContainer, stream: av.VideoStream, index: int) -> None:
         """Seek to the last key frame that is shown no later than an image, or to an earlier key frame.
 
-        Depending on the container, the seek target is a presentation time or a decoding time. The presentation time
-        is tried first (a decoding time would lead to one key frame too early in MP4); if this leads past the image, the
-        decoding time is used.
+        Containers seek by presentation or by decoding time. A decoding time would lead to one key frame too early in
+        MP4, so it is used only if the presentation time leads past the image.
         """
         for time in (self._pts[self._key_before[index]], self._seek_dts[index]):
             container.seek(int(time), stream=stream, backward=True)
@@ -238,8 +230,7 @@ class Video(Clip):
     ) -> Iterator[av.VideoFrame]:
         """Yield decoded images from the current position on; before time stamp `first`, decode only reference images.
 
-        Time stamps of packets that are damaged according to container flags or checksums are added to `broken`, with
-        those of all later packets up to the next key frame.
+        Time stamps of packets that flags or checksums mark as damaged are added to `broken`, up to the next key frame.
         """
         if not (alpha and self._alpha_decoder):
             damaged = False

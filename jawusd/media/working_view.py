@@ -28,10 +28,7 @@ def remap(image: NDArray[_Pixel], positions: NDArray[np.float32]) -> NDArray[_Pi
 
 
 def _needed(picture: DecodedPicture, positions: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """Convert only the bounding box of positions (h, w, 2) [px] in an image.
-
-    The rest of the result is black and takes no memory, since untouched pages are not allocated.
-    """
+    """Convert only the bounding box of positions (h, w, 2) [px]; the rest is black and takes no memory."""
     sides = np.concatenate([positions[0], positions[-1], positions[:, 0], positions[:, -1]])
     limit = np.array(picture.shape[1::-1])
     low = np.clip(np.floor(sides.min(0)), 0, limit - 1).astype(int)
@@ -46,8 +43,8 @@ class WorkingView:
     """Undistort and downscale the images of one camera; thread-safe.
 
     A working pixel is the mean of n x n bilinear samples of the recorded image, at the distorted positions of the
-    pixels of an n times larger working image; n is the downscaling factor, rounded up. This equals undistortion at
-    full size followed by area averaging, but interpolates once, and only where needed.
+    pixels of an n times larger working image; n is the downscaling factor, rounded up. Unlike undistortion at full size
+    followed by area averaging, this interpolates once, and only where needed.
 
     Attributes:
         camera: the pinhole camera of the working images.
@@ -80,8 +77,6 @@ class WorkingView:
 
     def mask(self, mask: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Return the coverage of each working pixel, 255 = full, (h, w), from a recorded mask (H, W).
-
-        Only regions around non-black pixels are processed.
 
         Raises:
             ValueError: the mask does not have the size of the recorded images.
@@ -164,11 +159,8 @@ class WorkingView:
 def warp_nearest(
     picture: NDArray[np.uint8] | NDArray[np.float32], to_picture: Array, out: NDArray[np.uint8] | NDArray[np.float32]
 ) -> None:
-    """Resample by nearest neighbour through an affine map; 0 outside the image.
+    """Resample an image (H, W) by nearest neighbour to `out` (h, w) of the same dtype; 0 outside the image.
 
-    Args:
-        picture: input image, shape (H, W).
-        to_picture: affine map from pixels of `out` to pixels of `picture`, shape (2, 3).
-        out: output image with the dtype of `picture`, shape (h, w).
+    `to_picture` (2, 3) maps pixels of `out` to pixels of `picture`.
     """
     cv2.warpAffine(picture, to_picture, out.shape[::-1], out, cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP)

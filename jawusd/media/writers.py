@@ -20,10 +20,7 @@ _QUALITY = 95
 
 
 class VideoWriter:
-    """Writer of a video file, as a context manager.
-
-    The file gets its name only if the block succeeds.
-    """
+    """Writer of a video file, as a context manager; the file gets its name only if the block succeeds."""
 
     def __init__(
         self,
@@ -34,10 +31,9 @@ class VideoWriter:
         lossless: bool = False,
         quality_crf: int = 16,
     ) -> None:
-        """Prepare the video file.
+        """Prepare the video file, `.mp4` for H.264 (yuv420p), `.mkv` for lossless FFV1 gray.
 
         Args:
-            path: `.mp4` for H.264 (yuv420p), `.mkv` for lossless FFV1 gray.
             size_px: (width, height); both even for H.264.
             quality_crf: constant rate factor of H.264, 0 (best) to 51.
 
