@@ -216,12 +216,13 @@ def to_numbers(cells: Sequence[Sequence[str]], named: Callable[[int, int], str],
     except ValueError as error:
         for i, row in enumerate(cells):
             for j, cell in enumerate(row):
-                if not _is_number(cell):
+                if not is_number(cell):
                     raise FormatError(f'{named(i, j)}: "{cell:.80}" is not a number.', path=path) from error
         raise
 
 
-def _is_number(cell: str) -> bool:
+def is_number(cell: str) -> bool:
+    """Return whether a text is a number."""
     try:
         float(cell)
     except ValueError:
@@ -233,7 +234,7 @@ def _with_points(cells: Sequence[Sequence[str]], named: Callable[[int, int], str
     """Return the cells with decimal commas replaced by points."""
     flat = [(i, j, cell.strip()) for i, row in enumerate(cells) for j, cell in enumerate(row)]
     commas = [place for place in flat if "," in place[2]]
-    point = next((place for place in flat if "." in place[2] and _is_number(place[2].replace(",", ""))), None)
+    point = next((place for place in flat if "." in place[2] and is_number(place[2].replace(",", ""))), None)
     i, j, cell = commas[0]
     if point is not None:
         raise FormatError(

@@ -9,15 +9,15 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from jawusd.base.arrays import Array
 from jawusd.base.errors import CalibrationError, FormatError, OutputError
-from jawusd.base.tables import read_text
-from jawusd.cameras.files import MOST_BYTES, CameraFormat, cameras_of_images, corner_matrix, files_in
+from jawusd.base.tables import is_number, read_text
+from jawusd.cameras.files import MOST_BYTES, CameraFormat, cameras_of_images, corner_matrix, files_in, numbers
 from jawusd.formats.atomic import write_text_atomic
 from jawusd.geometry import Camera, make_transform, matrix_from_wxyz, wxyz_from_matrix
 
@@ -52,7 +52,7 @@ def load_colmap(folder: str | os.PathLike[str]) -> list[Camera]:
     for row in _image_rows(path):
         if row[8] not in lenses:
             raise CalibrationError(f"image {row[9]} refers to camera {row[8]}, which is not in cameras.txt.", path=path)
-        q, t = np.split(_floats(path, row[1:8]), [4])
+        q, t = np.split(numbers(path, " ".join(row[1:8]), 7, f"image {row[9]}"), [4])
         if not np.linalg.norm(q) > 0:
             raise CalibrationError(f"image {row[9]} has a zero quaternion.", path=path)
         size, K, distortion = lenses[row[8]]
@@ -82,21 +82,13 @@ def _image_rows(path: Path) -> Iterator[list[str]]:
         if not row or (after_image and _POINTS.fullmatch(" ".join(row))):
             after_image = False
             continue
-        if len(row) < 10 or not all(_is_number(word) for word in row[:9]):
+        if len(row) < 10 or not all(is_number(word) for word in row[:9]):
             raise CalibrationError(
                 f'"{" ".join(row):.80}" is not an image line; expected ID, 4 + 3 pose values, camera ID and name.',
                 path=path,
             )
         after_image = True
         yield row
-
-
-def _is_number(word: str) -> bool:
-    try:
-        float(word)
-    except ValueError:
-        return False
-    return True
 
 
 def _rows(path: Path) -> list[list[str]]:
@@ -116,16 +108,6 @@ def _rows(path: Path) -> list[list[str]]:
     return [line.split() for line in text.split("\n") if not line.lstrip().startswith("#")]
 
 
-def _floats(path: Path, words: Iterable[str]) -> Array:
-    try:
-        values = np.array([float(word) for word in words])
-    except ValueError as error:
-        raise CalibrationError(f'"{" ".join(words)}" is not a list of numbers.', path=path) from error
-    if not np.isfinite(values).all():
-        raise CalibrationError(f'"{" ".join(words)}" has a value that is not finite.', path=path)
-    return values
-
-
 def _lens(path: Path, row: list[str]) -> tuple[tuple[int, int], Array, Array]:
     if len(row) < 5 or row[1] not in _MODELS:
         found = row[1] if len(row) > 1 else "nothing"
@@ -135,10 +117,8 @@ def _lens(path: Path, row: list[str]) -> tuple[tuple[int, int], Array, Array]:
             hint="Undistort the footage first, or solve again with --ImageReader.camera_model OPENCV.",
         )
     focal, terms = _MODELS[row[1]]
-    values = _floats(path, row[2:])
     expected = 2 + (3 if focal == "f" else 4) + terms
-    if len(values) != expected:
-        raise CalibrationError(f"camera {row[0]} has {len(values)} values; model {row[1]} has {expected}.", path=path)
+    values = numbers(path, " ".join(row[2:]), expected, f"camera {row[0]} of the model {row[1]}")
     size = (int(values[0]), int(values[1]))
     fx, fy, cx, cy = (values[2], *values[2:5]) if focal == "f" else values[2:6]
     distortion = values[expected - terms :]

@@ -73,20 +73,17 @@ def files_of_3de(path: Path) -> list[Path]:
 def _camera(path: Path, node: NukeNode, lenses: list[FoundLens], sizes: Mapping[str, Size]) -> Camera:
     name = node.name
     size = known_size(path, name, sizes)
-    focal_mm = float(steady_values(path, node, "focal", (50.0,))[0])
-    back = (
-        float(steady_values(path, node, "haperture", (24.576,))[0]),
-        float(steady_values(path, node, "vaperture", (18.672,))[0]),
-    )
+    defaults = (("focal", 50.0), ("haperture", 24.576), ("vaperture", 18.672))
+    focal_mm, *sides = (float(steady_values(path, node, knob, (default,))[0]) for knob, default in defaults)
+    back = (sides[0], sides[1])
     if not (focal_mm > 0 and min(back) > 0):
         raise CalibrationError(
             f"camera {name} has focal length {focal_mm:g} mm and film back {back[0]:g} x {back[1]:g} mm; "
             "all three must be greater than 0 mm.",
             path=path,
         )
-    if (steady_values(path, node, "win_scale", (1.0, 1.0)) != 1).any() or steady_values(path, node, "winroll", (0.0,))[
-        0
-    ] != 0:
+    scale, roll = steady_values(path, node, "win_scale", (1.0, 1.0)), steady_values(path, node, "winroll", (0.0,))
+    if (scale != 1).any() or roll[0] != 0:
         raise CalibrationError(
             f"camera {name} has win_scale or winroll set; expected win_scale 1 1 and winroll 0.", path=path
         )

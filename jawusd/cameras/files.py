@@ -141,8 +141,10 @@ def numbers(path: Path, text: str, count: int, what: str) -> Array:
         values = np.array([float(word) for word in text.split()])
     except ValueError as error:
         raise CalibrationError(f'{what}: "{text:.60}" is not a list of numbers.', path=path) from error
-    if len(values) != count or not np.isfinite(values).all():
-        raise CalibrationError(f"{what} has {len(values)} values; expected {count} finite numbers.", path=path)
+    if len(values) != count:
+        raise CalibrationError(f"{what} has {len(values)} values; expected {count}.", path=path)
+    if not np.isfinite(values).all():
+        raise CalibrationError(f"{what} has a value that is not finite.", path=path)
     return values
 
 

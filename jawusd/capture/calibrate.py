@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import TypedDict
 
 import numpy as np
@@ -64,10 +64,6 @@ class CalibrationReport:
     scale: ScaleCheck  # check of the board's square size against the size of the teeth
     advice: tuple[str, ...]  # possible improvements of the calibration, one sentence each
     notes: tuple[str, ...]  # assumptions of the calibration, one sentence each
-
-    def as_dict(self) -> dict[str, object]:
-        """Return the report as plain data."""
-        return asdict(self)
 
 
 def calibrate_capture(

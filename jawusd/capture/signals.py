@@ -60,14 +60,6 @@ class Offset:
     confidence: float  # fraction of matched light steps, or `SoundMatch.confidence`; 0 to 1
 
 
-@dataclass(frozen=True)
-class Flashes:
-    """Light steps of one video."""
-
-    steps: list[Step]  # light steps in temporal order
-    reason: str = ""  # why there are too few brightness changes to synchronise; empty if there are enough
-
-
 def find_steps(brightness: Array, first_frame: int = 0) -> list[Step]:
     """Return the light steps in temporal order; none if no change is as large as that of a flash.
 
@@ -169,8 +161,10 @@ def to_frames(steps: list[Step], numbers: NDArray[np.int64]) -> list[Step]:
     return out
 
 
-def find_flashes(video: Clip) -> Flashes:
-    """Find the light steps near both ends of a video; widen the search until there are enough.
+def find_flashes(video: Clip) -> tuple[list[Step], str]:
+    """Return light steps near both ends of a video in temporal order, and why there are too few; "" if enough.
+
+    The search is widened until there are enough.
 
     Raises:
         CaptureError: the video cannot be decoded.
@@ -184,17 +178,16 @@ def find_flashes(video: Clip) -> Flashes:
         if len(tail) < _FEWEST_STEPS:
             tail = find_steps(_brightness(video, video.count - window, video.count), video.count - window)
         if min(len(head), len(tail)) >= _FEWEST_STEPS:
-            return Flashes(head + tail)
+            return head + tail, ""
         window *= 2
     brightness = _brightness(video, 0, video.count)
     steps = find_steps(brightness)
     if len(steps) >= _FEWEST_STEPS:
-        return Flashes(steps)
-    return Flashes(
-        steps,
+        return steps, ""
+    return steps, (
         f"shows no light flash: {len(steps)} sudden changes, brightness {brightness.min():.0f} to "
         f"{brightness.max():.0f} of 255 over all {video.count} frames; a flash changes brightness by more than "
-        f"{_CONTRAST:.0%} and back",
+        f"{_CONTRAST:.0%} and back"
     )
 
 

@@ -23,34 +23,23 @@ _BACK_PX = 0.7  # maximum forward-backward error of a tracked point
 
 @dataclass(frozen=True, eq=False)
 class SkinView:
-    """One camera's working images: undistorted and gray.
+    """One camera's working images: undistorted and gray."""
 
-    Attributes:
-        camera: the pinhole camera of the working images.
-        side_px: side of the patch around a point.
-        px_per_mm: resolution at the mouth.
-    """
-
-    camera: Camera
-    side_px: int
-    px_per_mm: float
+    camera: Camera  # the pinhole camera of the working images
+    side_px: int  # side of the patch around a point
+    px_per_mm: float  # resolution at the mouth
     _working: WorkingView
 
     @classmethod
     def of(cls, source: Camera, mouth_world: Array) -> SkinView:
         """Choose the working size by the resolution at the mouth, at a world point (3,) [mm]."""
-        recorded = float(np.sqrt(source.K[0, 0] * source.K[1, 1]) / source.depth(mouth_world))
-        scale = min(1.0, _PX_PER_MM / recorded)
-        width, height = (max(1, round(side * scale)) for side in source.size_px)
-        working = WorkingView(source, (width, height))
-        side = max(_LEAST_SIDE_PX, 2 * round(_WINDOW_MM * recorded * scale / 2) + 1)
-        return cls(working.camera, side, recorded * scale, working)
+        working, px_per_mm = WorkingView.near(source, mouth_world, _PX_PER_MM)
+        side = max(_LEAST_SIDE_PX, 2 * round(_WINDOW_MM * px_per_mm / 2) + 1)
+        return cls(working.camera, side, px_per_mm, working)
 
     def picture(self, image: ColourPicture) -> Gray:
         """Return the working image (h, w) of a recorded RGB image (H, W, 3)."""
-        width, height = self.camera.size_px
-        part = self._working.part(image, (slice(0, height), slice(0, width)))
-        return np.asarray(cv2.cvtColor(part, cv2.COLOR_RGB2GRAY), np.uint8)
+        return np.asarray(cv2.cvtColor(self._working.picture(image), cv2.COLOR_RGB2GRAY), np.uint8)
 
 
 def followed(

@@ -60,7 +60,8 @@ def estimate_offsets(capture: Capture) -> Alignment:
     """Synchronise the cameras of a capture by light flashes, sound or clocks of their videos; see `align_videos`.
 
     Raises:
-        SyncError: a camera has no video, or the videos have neither light flashes nor sound.
+        SyncError: a camera has no video, the videos have neither light flashes nor sound, or a clip lacks the clock,
+            has another frame rate or does not overlap the others in time.
         CaptureError: a video cannot be read.
     """
     videos = {camera.name: camera.clip for camera in capture.cameras if camera.clip is not None}
@@ -73,7 +74,7 @@ def estimate_offsets(capture: Capture) -> Alignment:
             )
     if capture.sync.method in ("timecode", "numbers"):
         by = "time code" if capture.sync.method == "timecode" else "frame numbers"
-        offsets, notes = offsets_by_clock(capture)
+        offsets, notes = _offsets_by_clock(capture, {name: open_clip(video) for name, video in videos.items()})
         return Alignment(capture.reference, offsets, by, notes)
     found = align_videos(videos, capture.reference, by_light=capture.sync.method != "audio")
     rate = open_clip(videos[capture.reference]).timeline.rate
@@ -97,15 +98,15 @@ def align_videos(videos: Mapping[str, Path | ClipSource], reference: str, *, by_
     opened = {name: open_clip(clip) for name, clip in videos.items()}
     hint = _offsets_hint(videos)
     rate = opened[reference].timeline.rate
-    check_frame_rates(opened, reference)
+    _check_frame_rates(opened, reference)
     notes = _missing_pictures(opened)
     with ThreadPoolExecutor(max_workers=len(opened)) as pool:
         dark = None
         if by_light:
             found = dict(zip(opened, pool.map(find_flashes, opened.values())))
-            dark = next((name for name in opened if found[name].reason), None)
+            dark = next((name for name in opened if found[name][1]), None)
         if by_light and dark is None:
-            steps = {name: to_frames(found[name].steps, video.timeline.numbers) for name, video in opened.items()}
+            steps = {name: to_frames(found[name][0], video.timeline.numbers) for name, video in opened.items()}
             offsets = {
                 name: _compared(name, reference, video, hint, partial(match_steps, steps[name], steps[reference], rate))
                 for name, video in opened.items()
@@ -115,7 +116,7 @@ def align_videos(videos: Mapping[str, Path | ClipSource], reference: str, *, by_
             lambda video: read_sound(video.path, RATE_HZ) if isinstance(video, Video) else None, opened.values()
         )
         sounds = {name: sound for name, sound in zip(opened, found_sounds) if sound is not None}
-    why = "" if dark is None else f"camera {dark} {found[dark].reason}; "
+    why = "" if dark is None else f"camera {dark} {found[dark][1]}; "
     silent = [name for name in opened if name not in sounds]
     if silent:
         whose = "no clip has" if len(silent) == len(opened) else f"camera {silent[0]} has no"
@@ -193,12 +194,8 @@ _NEARLY_WHOLE = 0.01
 _FASTEST_USUAL = 30.5  # frame rate [Hz] above which two or four images often have the same time code
 
 
-def check_frame_rates(clips: Mapping[str, Clip], reference: str) -> None:
-    """Check that all clips have the frame rate of the reference camera.
-
-    Raises:
-        SyncError: a clip has a different frame rate.
-    """
+def _check_frame_rates(clips: Mapping[str, Clip], reference: str) -> None:
+    """Raise SyncError if a clip does not have the frame rate of the reference camera."""
     rate = clips[reference].timeline.rate
     for name, clip in clips.items():
         if abs(clip.timeline.rate / rate - 1) > _RATE_TOLERANCE:
@@ -209,21 +206,9 @@ def check_frame_rates(clips: Mapping[str, Clip], reference: str) -> None:
             )
 
 
-def offsets_by_clock(capture: Capture) -> tuple[dict[str, Offset], tuple[str, ...]]:
-    """Return the offset of each camera, and notes for the user, from the clock in `[sync] method`.
-
-    Raises:
-        SyncError: a camera has no video or its clip does not have this clock, the clips do not overlap in time, or the
-            frame rates of the clips differ.
-        CaptureError: a clip cannot be read.
-    """
-    path = capture.folder / "capture.toml"
-    clips: dict[str, Clip] = {}
-    for camera in capture.cameras:
-        if camera.clip is None:
-            raise SyncError("has no video, so there is no clock for synchronisation.", camera=camera.name, path=path)
-        clips[camera.name] = open_clip(camera.clip)
-    check_frame_rates(clips, capture.reference)
+def _offsets_by_clock(capture: Capture, clips: Mapping[str, Clip]) -> tuple[dict[str, Offset], tuple[str, ...]]:
+    """Return the offset of each camera, and notes for the user, from the clock in `[sync] method`."""
+    _check_frame_rates(clips, capture.reference)
     by_code = capture.sync.method == "timecode"
     starts = _timecodes(clips) if by_code else _numbers(capture, clips)
     reference = starts[capture.reference]
@@ -261,11 +246,7 @@ def _notes(clips: Mapping[str, Clip]) -> Iterator[str]:
 
 
 def _frames_of_number(clip: Clip) -> int:
-    """Return the number of images that have the same time code.
-
-    Raises:
-        CaptureError: the number is not an integer.
-    """
+    """Return the number of images that have the same time code; raise CaptureError if it is not an integer."""
     ratio = clip.timeline.rate / (clip.timecode_fps or clip.timeline.rate)
     if round(ratio) < 1 or abs(ratio / round(ratio) - 1) > _NEARLY_WHOLE:
         raise CaptureError(

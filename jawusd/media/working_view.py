@@ -75,6 +75,14 @@ class WorkingView:
         steps = [np.abs(np.diff(self._nodes, axis=axis)).max(initial=_NODE_PX) for axis in (1, 2)]
         self._reach_px = float(max(steps)) + 1
 
+    @classmethod
+    def near(cls, source: Camera, point_world: Array, px_per_mm: float) -> tuple[WorkingView, float]:
+        """Return the view with a given or the recorded resolution [px/mm] at a point (3,) [mm], and its resolution."""
+        recorded = float(np.sqrt(source.K[0, 0] * source.K[1, 1]) / source.depth(point_world))
+        scale = min(1.0, px_per_mm / recorded)
+        width, height = (max(1, round(side * scale)) for side in source.size_px)
+        return cls(source, (width, height)), recorded * scale
+
     def mask(self, mask: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Return the coverage of each working pixel, 255 = full, (h, w), from a recorded mask (H, W).
 
@@ -89,15 +97,14 @@ class WorkingView:
             out[window] = self._averaged(mask, window)
         return out
 
-    def picture(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    def picture(self, image: ColourPicture) -> NDArray[np.uint8]:
         """Return a recorded image, (H, W) or (H, W, 3), at the working size; black where nothing was recorded.
 
         Raises:
             ValueError: the image does not have the recorded size.
         """
-        self._check(image)
         width, height = self.camera.size_px
-        return self._averaged(image, (slice(0, height), slice(0, width)))
+        return self.part(image, (slice(0, height), slice(0, width)))
 
     def light(self, image: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return a recorded linear-light image (H, W, 3) undistorted at full size; 0 where nothing was recorded.

@@ -37,12 +37,8 @@ class PictureFrame:
 
     def __init__(self, source: Camera, centre_world: Array, px_per_mm: float) -> None:
         """Choose the working image size from the resolution at the teeth, near `centre_world` [mm]; never upsample."""
-        recorded = float(np.sqrt(source.K[0, 0] * source.K[1, 1]) / source.depth(centre_world))
-        scale = min(1.0, px_per_mm / recorded)
-        self.px_per_mm = recorded * scale
         self.source = source
-        width, height = (max(1, round(side * scale)) for side in source.size_px)
-        self._working = WorkingView(source, (width, height))
+        self._working, self.px_per_mm = WorkingView.near(source, centre_world, px_per_mm)
         self._back = _positions(source, self._working.camera)
 
     def window(self, image: ColourPicture, points_world: Array, margin_mm: float) -> Window | None:

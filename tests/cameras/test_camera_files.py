@@ -78,7 +78,7 @@ def change(path, old, new):
     ("file", "old", "new", "words"),
     [
         ("cameras.txt", "PINHOLE", "OPENCV_FISHEYE", "model OPENCV_FISHEYE; it must be one of SIMPLE_PINHOLE"),
-        ("cameras.txt", "900.0 910.0", "900.0", "camera 1 has 5 values; model PINHOLE has 6"),
+        ("cameras.txt", "900.0 910.0", "900.0", "camera 1 of the model PINHOLE has 5 values; expected 6"),
         ("cameras.txt", "900.0", "many", "is not a list of numbers"),
         ("cameras.txt", "900.0", "-900.0", "focal lengths -900"),
         ("images.txt", "0.9 0.1 -0.3 0.2", "0 0 0 0", "zero quaternion"),
