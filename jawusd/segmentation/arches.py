@@ -13,13 +13,13 @@ from jawusd.base.arrays import Array, Mask
 from jawusd.formats.mesh import Mesh, crown_face_mask
 from jawusd.geometry import Camera, transform_points
 from jawusd.meshes.raster import draw_depth_labels
+from jawusd.segmentation.border import ARCH_BLUR_PX, signed_distance
 from jawusd.segmentation.colours import ColourModel, SegmentationConfig
 
 OTHER, UPPER, LOWER = 0, 1, 2
 _TAU = _SIGMA = 0.35  # step sizes tau and sigma of the primal-dual iteration, which converges if 8 tau sigma < 1
 _NEVER = 30.0  # magnitude of log-odds that act as a hard constraint
 _FEWEST_OPEN = 20  # minimum number of undecided pixels between the arches for re-estimating their border
-_ARCH_BLUR_PX = 0.8  # sigma of the blur that makes the coverage fractional at the border between the arches
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +53,8 @@ class Expectation:
 def expect_crowns(scans: tuple[ScanSurface, ScanSurface], poses: Array, camera: Camera) -> Expectation:
     """Render both arches at poses (2, 4, 4), T_world_upper and T_world_lower, with a pinhole camera."""
     labels = draw_crowns(scans, poses, camera)
-    return Expectation(labels, np.stack([_signed_distance(labels == label) for label in (UPPER, LOWER)]))
+    away = np.stack([signed_distance(labels == label) for label in (UPPER, LOWER)])
+    return Expectation(labels, np.where(away > 0, away - np.float32(0.5), away + np.float32(0.5)))
 
 
 def draw_crowns(scans: tuple[ScanSurface, ScanSurface], poses: Array, camera: Camera) -> NDArray[np.uint8]:
@@ -66,15 +67,6 @@ def draw_crowns(scans: tuple[ScanSurface, ScanSurface], poses: Array, camera: Ca
         draw_depth_labels(points, scan.gum_faces, 0, 0, False, inverse_depth, labels, OTHER)
         draw_depth_labels(points, scan.crown_faces, 0, 0, False, inverse_depth, labels, label)
     return labels
-
-
-def _signed_distance(region: Mask) -> NDArray[np.float32]:
-    """Return the signed distance to a region's outline, positive inside [px]; a large negative value if empty."""
-    if not region.any():
-        return np.full(region.shape, -1e3, np.float32)
-    inner = cv2.distanceTransform(region.astype(np.uint8), cv2.DIST_L2, 5)
-    outer = cv2.distanceTransform((~region).astype(np.uint8), cv2.DIST_L2, 5)
-    return np.where(region, inner - 0.5, 0.5 - outer)
 
 
 @numba.njit(nogil=True, cache=True)
@@ -185,25 +177,6 @@ class Seeds:
         return np.where(other[::-1] & ~self.known, 0, shares)
 
 
-def learn_colours(
-    model: ColourModel,
-    rgb: NDArray[np.uint8],
-    expected: Expectation,
-    config: SegmentationConfig,
-    px_per_mm: float,
-    weight: float = 1.0,
-) -> None:
-    """Update a colour model with an image (h, w, 3) and the expected position of the crowns."""
-    nearest = expected.inside_px.max(0) / px_per_mm
-    model.learn(rgb, nearest > config.inner_mm, nearest < -config.outer_mm, weight)
-
-
-def excess_odds(rgb: NDArray[np.uint8], model: ColourModel, config: SegmentationConfig) -> NDArray[np.float32]:
-    """Return the log-odds that pixels are tooth, from colour alone, minus the required threshold, shape (h, w)."""
-    demanded = model.surroundings_quantile(config.surroundings_share) + config.doubt
-    return model.log_odds(rgb) - np.float32(np.clip(demanded, *config.doubt_range))
-
-
 def cut_arches(
     rgb: NDArray[np.uint8],
     expected: Expectation,
@@ -220,7 +193,8 @@ def cut_arches(
         seeds: annotations, which act as hard constraints.
     """
     inside = expected.inside_px / px_per_mm
-    odds = excess_odds(rgb, model, config)
+    demanded = model.surroundings_quantile(config.surroundings_share) + config.doubt
+    odds = model.log_odds(rgb) - np.float32(np.clip(demanded, *config.doubt_range))
     cost = np.zeros((3, *rgb.shape[:2]), np.float32)
     apart = np.clip(config.rows_per_mm * (inside[0] - inside[1]) / 2, -3, 3)
     for label, arch, sign in ((UPPER, 0, 1.0), (LOWER, 1, -1.0)):
@@ -267,7 +241,7 @@ def separate_arches(
     start = np.stack([np.zeros_like(upper), upper, ~upper]).astype(np.float32)
     prices = _edge_prices(rgb[box], config, open_px)
     found = cut_three_ways(cost, prices, start, open_px, config.arch_steps)
-    share = cv2.GaussianBlur(found[UPPER], (0, 0), _ARCH_BLUR_PX)
+    share = cv2.GaussianBlur(found[UPPER], (0, 0), ARCH_BLUR_PX)
     out = shares.copy()
     near = cv2.dilate(open_px.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
     for r, part in ((0, share), (1, 1 - share)):
@@ -284,7 +258,7 @@ def _edge_prices(rgb: NDArray[np.uint8], config: SegmentationConfig, where: Mask
     out = np.full((2, *rgb.shape[:2]), config.border, np.float32)
     squares = [((smooth[:, 1:] - smooth[:, :-1]) ** 2).sum(2), ((smooth[1:] - smooth[:-1]) ** 2).sum(2)]
     parts = squares if where is None else (squares[0][where[:, 1:]], squares[1][where[1:]])
-    scale = 2 * sum(float(part.mean()) for part in parts) / 2 + 1e-6
+    scale = sum(float(part.mean()) for part in parts) + 1e-6
     low = config.border_on_edge
     out[0, :, :-1] *= low + (1 - low) * np.exp(-squares[0] / scale)
     out[1, :-1] *= low + (1 - low) * np.exp(-squares[1] / scale)

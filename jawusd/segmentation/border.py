@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -13,17 +11,8 @@ from jawusd.segmentation.colours import SegmentationConfig, log_chroma
 
 _EVEN = 1e-4  # variance added to the variance of the log colours [-], for errors of half an 8-bit step
 _FEWEST = 100  # minimum number of pixels near the border for estimating the covariance of colours
-_ARCH_BLUR_PX = 0.8  # sigma of the blur that makes the coverage fractional at the border between the arches
+ARCH_BLUR_PX = 0.8  # sigma of the blur that makes the coverage fractional at the border between the arches
 _FAR_BLUR_PX = 2.0  # sigma of the blur that assigns tooth pixels far from both arches to the nearer arch
-
-
-@dataclass(frozen=True, eq=False)
-class _Sides:
-    """Classification of every pixel by the local colours on both sides of the border."""
-
-    share: NDArray[np.float32]  # tooth coverage, 0.5 midway between the sides, shape (h, w)
-    # separation of the colours of both sides in standard deviations; 0 unless both sides are nearby; shape (h, w)
-    contrast: NDArray[np.float32]
 
 
 def refine_borders(
@@ -39,16 +28,17 @@ def refine_borders(
     """
     colours = _blurred(log_chroma(rgb), config.border_blur_px)
     band, window = config.border_band_mm * px_per_mm, 2 * round(config.border_side_mm * px_per_mm) + 1
-    inside = _signed_distance(shares.sum(0) > 0.5)
+    inside = signed_distance(shares.sum(0) > 0.5)
     sides = _compare_sides(inside, colours, window)
     if sides is None:
         return shares, np.zeros(rgb.shape[:2], bool)
-    clear = sides.contrast > config.border_contrast
+    share, contrast = sides
+    clear = contrast > config.border_contrast
     moved = clear & (np.abs(inside) < band)
-    teeth = np.where(moved, np.clip(sides.share, 0, 1), inside > 0).astype(np.float32)
+    teeth = np.where(moved, np.clip(share, 0, 1), inside > 0).astype(np.float32)
     teeth[_spurious(teeth > 0.5, clear, config)] = 0.0
-    near = [_blurred(share, _ARCH_BLUR_PX) for share in shares]
-    far = [_blurred(share, _FAR_BLUR_PX) for share in shares]
+    near = [_blurred(arch, ARCH_BLUR_PX) for arch in shares]
+    far = [_blurred(arch, _FAR_BLUR_PX) for arch in shares]
     upper, lower = np.where(near[0] + near[1] > 0.2, near, far)
     teeth = _blurred(teeth, config.border_blur_px)
     return teeth * np.stack([upper, lower]) / np.maximum(upper + lower, 1e-6), clear
@@ -58,14 +48,22 @@ def _blurred(image: NDArray[np.float32], sigma_px: float) -> NDArray[np.float32]
     return np.asarray(cv2.GaussianBlur(image, (0, 0), sigma_px), np.float32)
 
 
-def _signed_distance(region: Mask) -> NDArray[np.float32]:
-    """Return the signed distance to a region's outline, positive inside [px]."""
+def signed_distance(region: Mask) -> NDArray[np.float32]:
+    """Return the signed distance to a region's outline, positive inside [px]; a large negative value if empty."""
+    if not region.any():
+        return np.full(region.shape, -1e3, np.float32)
     inner = cv2.distanceTransform(region.astype(np.uint8), cv2.DIST_L2, 5)
     return inner - cv2.distanceTransform((~region).astype(np.uint8), cv2.DIST_L2, 5)
 
 
-def _compare_sides(inside: NDArray[np.float32], colours: NDArray[np.float32], window: int) -> _Sides | None:
-    """Compare every pixel with the local mean colours on both sides of the border; None if one side is empty."""
+def _compare_sides(
+    inside: NDArray[np.float32], colours: NDArray[np.float32], window: int
+) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
+    """Compare every pixel with the local mean colours on both sides of the border; None if one side is empty.
+
+    Return the tooth coverage, 0.5 midway between the sides, and the separation of their colours in standard deviations,
+    0 unless both sides are nearby; shape (h, w) each.
+    """
     near = np.abs(inside) < window / 2
     sides = ((inside > 1) & near, (inside < -1) & near)
     means = [_mean_near(side, colours, window) for side in sides]
@@ -78,7 +76,7 @@ def _compare_sides(inside: NDArray[np.float32], colours: NDArray[np.float32], wi
     direction = apart @ precision
     contrast = (direction * apart).sum(2)
     share = 0.5 + (direction * (colours - (tooth + other) / 2)).sum(2) / np.maximum(contrast, 1e-6)
-    return _Sides(share, np.where(has_tooth & has_other, np.sqrt(np.maximum(contrast, 0)), 0))
+    return share, np.where(has_tooth & has_other, np.sqrt(np.maximum(contrast, 0)), 0)
 
 
 def _mean_near(side: Mask, colours: NDArray[np.float32], window: int) -> tuple[NDArray[np.float32], Mask]:

@@ -13,7 +13,7 @@ from jawusd.base.arrays import Array, Mask
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry import Camera, transform_points
 from jawusd.media.pixels import ColourPicture
-from jawusd.segmentation.arches import Expectation, ScanSurface, Seeds, expect_crowns, learn_colours
+from jawusd.segmentation.arches import Expectation, ScanSurface, Seeds, expect_crowns
 from jawusd.segmentation.colours import ColourModel, SegmentationConfig
 from jawusd.segmentation.files import Key
 from jawusd.segmentation.learn import Example, cut_picture
@@ -149,7 +149,8 @@ class CameraSegmenter:
         """Update the colours with an image; annotated pixels have a higher weight."""
         c = self._config
         if not all(key is not None and key.finished for key in keys):
-            learn_colours(self.colours, window.rgb, expected, c, self._frame.px_per_mm)
+            nearest = expected.inside_px.max(0) / self._frame.px_per_mm
+            self.colours.learn(window.rgb, nearest > c.inner_mm, nearest < -c.outer_mm)
         if seeds is not None:
             kernel = np.ones((3, 3), np.uint8)
             teeth = np.any(seeds.known & (seeds.share > 0.5), axis=0).astype(np.uint8)

@@ -150,7 +150,7 @@ def write_sheet(
 def _tile(picture: NDArray[np.uint8], masks: Sequence[NDArray[np.uint8] | None], caption: str) -> NDArray[np.uint8]:
     """Return an RGB image that is cropped to its masks, with their outlines and a caption."""
     extent = np.zeros(picture.shape[:2], bool)
-    for _, mask, colour in zip(ARCHES, masks, (UPPER_COLOUR, LOWER_COLOUR), strict=True):
+    for mask, colour in zip(masks, (UPPER_COLOUR, LOWER_COLOUR), strict=True):
         if mask is not None:
             outlines = cv2.findContours((mask > 127).astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)[0]
             cv2.drawContours(picture, outlines, -1, colour, 2)
