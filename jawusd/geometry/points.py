@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from typing import TypeVar
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jawusd.base.arrays import Array
 from jawusd.geometry.se3 import make_transform, transform_points
+
+_Number = TypeVar("_Number", np.float64, np.int64)
 
 _MIN_ASPECT = 1e-6  # ratio of the second-largest to the largest extent of points below which they count as collinear
 
@@ -167,7 +171,7 @@ def _nearest(wanted: Array, points: Array, farthest: float) -> NDArray[np.int64]
     return found
 
 
-def welded(points: Array) -> tuple[Array, NDArray[np.int64]]:
+def welded(points: NDArray[_Number]) -> tuple[NDArray[_Number], NDArray[np.int64]]:
     """Return the distinct points and the index of each point, four times as fast as `numpy.unique` over rows.
 
     Args:

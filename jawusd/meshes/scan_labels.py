@@ -246,10 +246,8 @@ def _carried(surface: ScanSurface, up: Array, crowns: Mask, others: Mask) -> Mas
     out = np.zeros(len(others), dtype=bool)
     if not crowns.any() or not others.any():
         return out
-    height, piece, count = surface.vertices @ up, surface.piece, len(others)
-    low, high = np.full(count, np.inf), np.full(count, -np.inf)
-    np.minimum.at(low, piece, height)
-    np.maximum.at(high, piece, height)
+    piece, count = surface.piece, len(others)
+    low, high = _ranges(surface.vertices @ up, piece)
     standing = np.flatnonzero(crowns[piece])
     size = np.maximum(np.bincount(piece, minlength=count), 1)
     middle = np.stack([np.bincount(piece, axis, count) / size for axis in surface.vertices.T], axis=1)[others]
@@ -258,22 +256,25 @@ def _carried(surface: ScanSurface, up: Array, crowns: Mask, others: Mask) -> Mas
     return out
 
 
+def _ranges(values: Array, piece: Indices) -> tuple[Array, Array]:
+    """Return the smallest and largest value in every component, shape (P, ...), of the values at vertices (v, ...)."""
+    shape = (int(piece.max()) + 1, *values.shape[1:])
+    low, high = np.full(shape, np.inf), np.full(shape, -np.inf)
+    np.minimum.at(low, piece, values)
+    np.maximum.at(high, piece, values)
+    return low, high
+
+
 def _extent_mm(surface: ScanSurface) -> Array:
     """Return the bounding box diagonal of every component [mm], shape (P,)."""
-    count = int(surface.piece.max()) + 1
-    low, high = np.full((count, 3), np.inf), np.full((count, 3), -np.inf)
-    np.minimum.at(low, surface.piece, surface.vertices)
-    np.maximum.at(high, surface.piece, surface.vertices)
+    low, high = _ranges(surface.vertices, surface.piece)
     return np.asarray(np.linalg.norm(high - low, axis=1))
 
 
 def _height_share(surface: ScanSurface, up: Array) -> Array:
     """Return the relative height of each vertex in its component, from 0 (lowest) to 1 (highest), shape (v,)."""
     height = surface.vertices @ up
-    count = int(surface.piece.max()) + 1
-    low, high = np.full(count, np.inf), np.full(count, -np.inf)
-    np.minimum.at(low, surface.piece, height)
-    np.maximum.at(high, surface.piece, height)
+    low, high = _ranges(height, surface.piece)
     return np.asarray((height - low[surface.piece]) / np.maximum(high - low, 1e-9)[surface.piece])
 
 

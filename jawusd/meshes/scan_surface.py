@@ -7,7 +7,7 @@ more likely to reach a crown seed first than a gum seed (Grady, "Random walks fo
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,8 @@ from scipy.spatial import cKDTree
 
 from jawusd.base.arrays import Array, Indices, Mask
 from jawusd.formats.mesh import Mesh
+from jawusd.geometry.points import welded
+from jawusd.meshes.surfaces import summed_normals
 
 # Length [mm] over which normals are averaged before curvature is computed. Scanners round creases by a few tenths of a
 # millimetre and cause ripples of a few hundredths.
@@ -43,7 +45,8 @@ class ScanSurface:
     @classmethod
     def of(cls, mesh: Mesh) -> ScanSurface:
         """Return the cleaned surface of a scan."""
-        vertices, index = merged_places(mesh.vertices)
+        vertices, index = welded(mesh.vertices[:, ::-1])
+        vertices = np.ascontiguousarray(vertices[:, ::-1])
         merged = len(mesh.vertices) - len(vertices)
         faces = index[mesh.faces]
         solid = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
@@ -54,12 +57,8 @@ class ScanSurface:
             number = np.cumsum(used) - 1
             number[~used] = cKDTree(vertices[used]).query(vertices[~used])[1]
             vertices, index, faces = vertices[used], number[index], number[faces]
-        corners = np.sort(faces, axis=1)
         n = len(vertices)
-        order = np.lexsort(corners.T)
-        ranked = corners[order]
-        new = np.r_[True, (ranked[1:] != ranked[:-1]).any(axis=1)][: len(ranked)]
-        kept = np.sort(order[new])
+        kept = np.sort(np.unique(welded(np.sort(faces, axis=1))[1], return_index=True)[1])
         links = coo_array(
             (np.ones(3 * len(kept), np.int8), (faces[kept].ravel(), np.roll(faces[kept], 1, axis=1).ravel())),
             shape=(n, n),
@@ -104,19 +103,14 @@ class ScanSurface:
         np.maximum.at(highest, index, height)
         seen = height > highest[index] - _SEEN_MM / 2
         turned = (np.bincount(owner, np.where(seen, cross @ up, 0.0), int(self.piece.max()) + 1) < 0)[owner]
-        faces = np.where(turned[:, None], self.faces[:, ::-1], self.faces)
-        return ScanSurface(self.vertices, faces, self.of_vertex, self.piece, self.merged, self.empty, self.repeated)
+        return replace(self, faces=np.where(turned[:, None], self.faces[:, ::-1], self.faces))
 
     def normals(self) -> Array:
         """Return the unit normals of the vertices, averaged over a few tenths of a millimetre, shape (v, 3)."""
-        corners = self.vertices[self.faces]
-        cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        n = len(self.vertices)
-        corner = self.faces.ravel()
-        normals = np.stack([np.bincount(corner, np.repeat(cross[:, k], 3), n) for k in range(3)], axis=1)
+        normals = summed_normals(self.vertices, self.faces)
         edges = self.edges()
         length = self.edge_mm(edges)
-        mean = averaging(edges, n)
+        mean = averaging(edges, len(self.vertices))
         # The kernel of one averaging step has a standard deviation of about 0.7 edge lengths; variances add.
         for _ in range(int(np.clip(round(2 * (_SCALE_MM / max(length, 1e-6)) ** 2), 0, _MOST_ROUNDS))):
             normals = mean @ normals
@@ -171,16 +165,6 @@ class ScanSurface:
         fold = np.zeros(n)
         np.maximum.at(fold, pairs[first].ravel(), np.repeat(angle, 2))
         return fold
-
-
-def merged_places(vertices: Array) -> tuple[Array, Indices]:
-    """Return the unique positions (v, 3) of vertices (V, 3), and the index of the position of each vertex, (V,)."""
-    order = np.lexsort(vertices.T)
-    ranked = vertices[order]
-    new = np.r_[True, (ranked[1:] != ranked[:-1]).any(axis=1)]
-    index = np.empty(len(vertices), np.int64)
-    index[order] = np.cumsum(new) - 1
-    return np.ascontiguousarray(ranked[new]), index
 
 
 def averaging(edges: Indices, count: int) -> csr_array:

@@ -61,11 +61,14 @@ def superellipse(angle: Array, squareness: float) -> tuple[Array, Array]:
     return np.sign(c) * np.abs(c) ** squareness, np.sign(s) * np.abs(s) ** squareness
 
 
+def summed_normals(vertices: Array, faces: Faces | NDArray[np.int64]) -> Array:
+    """Return the sums of the normals of the faces at each vertex, which are twice as long as face areas, (V, 3)."""
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    corners = np.repeat(np.cross(b - a, c - a), 3, axis=0)
+    return np.stack([np.bincount(faces.ravel(), corners[:, k], len(vertices)) for k in range(3)], -1)
+
+
 def vertex_normals(vertices: Array, faces: Faces) -> Array:
     """Return area-weighted unit normals of the vertices, shape (V, 3)."""
-    a, b, c = (vertices[faces[:, k]] for k in range(3))
-    face_normals = np.cross(b - a, c - a)
-    corners = np.repeat(face_normals, 3, axis=0)
-    index = faces.ravel()
-    normals = np.stack([np.bincount(index, corners[:, k], len(vertices)) for k in range(3)], -1)
+    normals = summed_normals(vertices, faces)
     return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
