@@ -30,7 +30,6 @@ from jawusd.geometry.se3 import (
     se3_left_jacobian,
     se3_left_jacobian_inverse,
     se3_log,
-    se3_right_jacobian,
     transform_point,
     transform_points,
 )
@@ -42,8 +41,6 @@ from jawusd.geometry.so3 import (
     so3_left_jacobian,
     so3_left_jacobian_inverse,
     so3_log,
-    so3_right_jacobian,
-    vee,
     wxyz_from_matrix,
 )
 
@@ -70,15 +67,12 @@ __all__ = [
     "se3_left_jacobian",
     "se3_left_jacobian_inverse",
     "se3_log",
-    "se3_right_jacobian",
     "so3_exp",
     "so3_left_jacobian",
     "so3_left_jacobian_inverse",
     "so3_log",
-    "so3_right_jacobian",
     "transform_point",
     "transform_points",
     "triangulate",
-    "vee",
     "wxyz_from_matrix",
 ]

@@ -202,9 +202,7 @@ def opencv_lens(K: Array, recorded_px: Array, ideal: Array) -> tuple[Array, Arra
         off = float(np.abs(_through(best, ideal) - recorded_px).max())
         if off <= _TOLERANCE_PX:
             break
-    fx, fy, skew, cx, cy = best[:5]
-    fitted = np.array([[fx, skew, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-    return fitted, best[5:13], best[13:], off if np.isfinite(off) else np.inf
+    return _with_lens(best).K, best[5:13], best[13:], off if np.isfinite(off) else np.inf
 
 
 def _least_squares(values: Array, free: npt.NDArray[np.intp], recorded_px: Array, ideal: Array) -> Array:
@@ -235,12 +233,13 @@ def _least_squares(values: Array, free: npt.NDArray[np.intp], recorded_px: Array
 
 
 def _through(values: Array, ideal: Array) -> Array:
-    """Return the pixels (N, 2) of ideal points through K and OpenCV's lens model, as in `Camera`."""
-    fx, fy, skew, cx, cy, k1, k2, p1, p2, k3, k4, k5, k6 = values[:13]
+    """Return the pixels (N, 2) of ideal points through the lens of `opencv_lens` with these values (16,)."""
     turned = so3_exp(values[13:]) @ np.vstack([ideal.T, np.ones(len(ideal))])
-    x, y = turned[:2] / turned[2]
-    r2 = x * x + y * y
-    radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
-    dx = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
-    dy = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
-    return np.column_stack([fx * dx + skew * dy + cx, fy * dy + cy])
+    camera = _with_lens(values)
+    return camera._pixels(camera._distort((turned[:2] / turned[2]).T))
+
+
+def _with_lens(values: Array) -> Camera:
+    """Return a camera with fx, fy, skew, cx, cy [px] and eight distortion coefficients."""
+    fx, fy, skew, cx, cy = values[:5]
+    return Camera("", (1, 1), np.array([[fx, skew, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]), values[5:13], np.eye(4))

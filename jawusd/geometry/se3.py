@@ -97,11 +97,6 @@ def se3_left_jacobian(twist: ArrayLike) -> Array:
     return J
 
 
-def se3_right_jacobian(twist: ArrayLike) -> Array:
-    """Return J (..., 6, 6) with ``exp(twist + d) = exp(twist) exp(J d)`` to first order, for twists (..., 6)."""
-    return se3_left_jacobian(-np.asarray(twist, dtype=np.float64))
-
-
 def se3_left_jacobian_inverse(twist: ArrayLike) -> Array:
     """Return the inverse of `se3_left_jacobian`, shape (..., 6, 6)."""
     twist = np.asarray(twist, dtype=np.float64)

@@ -96,14 +96,6 @@ def hat(w: ArrayLike) -> Array:
     return out
 
 
-def vee(W: ArrayLike) -> Array:
-    """Return the vectors (..., 3) of matrices (..., 3, 3), the inverse of `hat`; the symmetric part is ignored."""
-    W = np.asarray(W, dtype=np.float64)
-    return 0.5 * np.stack(
-        [W[..., 2, 1] - W[..., 1, 2], W[..., 0, 2] - W[..., 2, 0], W[..., 1, 0] - W[..., 0, 1]], axis=-1
-    )
-
-
 def batched_angle_coefficients(squared: Array) -> tuple[Array, Array, Array]:
     """Return the coefficients a, b and c of `jawusd.geometry.rodrigues` at squared angles [rad^2] of any shape."""
     if np.ndim(squared) == 0 and squared < np.inf:  # one rotation: floats avoid the call overhead of numpy
@@ -153,11 +145,6 @@ def so3_left_jacobian(w: ArrayLike) -> Array:
     w = np.asarray(w, dtype=np.float64)
     _, b, c = batched_angle_coefficients(np.einsum("...i,...i->...", w, w))
     return _series(w, b, c)
-
-
-def so3_right_jacobian(w: ArrayLike) -> Array:
-    """Return J (..., 3, 3) with ``exp(w + dw) = exp(w) exp(J dw)`` to first order, for w (..., 3) [rad]."""
-    return so3_left_jacobian(-np.asarray(w, dtype=np.float64))
 
 
 def so3_left_jacobian_inverse(w: ArrayLike) -> Array:

@@ -73,11 +73,11 @@ def test_left_jacobian_is_the_derivative_of_exp(angle):
     )
     np.testing.assert_allclose(g.se3_left_jacobian(xi), numeric, atol=2e-7)
     np.testing.assert_allclose(g.se3_left_jacobian(xi) @ g.se3_left_jacobian_inverse(xi), np.eye(6), atol=1e-11)
-    # exp(xi) Jr = Ad(exp xi) Jr = Jl
+    # with the right Jacobian Jr(xi) = Jl(-xi): exp(xi) Jr = Ad(exp xi) Jr = Jl
     np.testing.assert_allclose(
-        g.se3_adjoint(g.se3_exp(xi)) @ g.se3_right_jacobian(xi), g.se3_left_jacobian(xi), atol=1e-10
+        g.se3_adjoint(g.se3_exp(xi)) @ g.se3_left_jacobian(-xi), g.se3_left_jacobian(xi), atol=1e-10
     )
-    np.testing.assert_allclose(g.so3_right_jacobian(xi[:3]), g.so3_left_jacobian(xi[:3]).T, atol=1e-12)
+    np.testing.assert_allclose(g.so3_left_jacobian(-xi[:3]), g.so3_left_jacobian(xi[:3]).T, atol=1e-12)
 
 
 def test_coupling_series_meets_the_closed_form():
