@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -100,19 +100,13 @@ def _starts(
 def _refined(bite: Bite, lines: Sequence[Drawing], rows: ArchPair, contact: Contact) -> Bite:
     """Return the photographs and the bite after coarse-to-fine alignment."""
     for share, gates in _STAGES:
-        photos = []
-        for photo, own in zip(bite.photos, lines, strict=True):
-            factor = min(1.0, share * _AT_WIDTH_PX / own.size_px[0])
-            drawing = own.shrunk(factor) if factor < 1.0 else own
-            photos.append(Photo(drawing, photo.pose.scaled(drawing.size_px[0] / photo.drawing.size_px[0])))
+        factors = [share * _AT_WIDTH_PX / own.size_px[0] for own in lines]
+        drawings = [own.shrunk(factor) if factor < 1.0 else own for own, factor in zip(lines, factors, strict=True)]
+        photos = tuple(photo.drawn(own) for photo, own in zip(bite.photos, drawings, strict=True))
         crowns = rows.fine if share == 1.0 else rows.thin
         aligner = Aligner(crowns, rows.usual.T_upper_lower, contact)
-        bite = aligner.aligned(Bite(tuple(photos), bite.T_upper_lower, bite.gum_mm), gates)
-    photos = [
-        Photo(own, photo.pose.scaled(own.size_px[0] / photo.drawing.size_px[0]))
-        for photo, own in zip(bite.photos, lines, strict=True)
-    ]
-    return Bite(tuple(photos), bite.T_upper_lower, bite.gum_mm)
+        bite = aligner.aligned(replace(bite, photos=photos), gates)
+    return replace(bite, photos=tuple(photo.drawn(own) for photo, own in zip(bite.photos, lines, strict=True)))
 
 
 def _together(alone: Sequence[Bite], lines: Sequence[Drawing], rows: ArchPair, contact: Contact) -> Bite:

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, label, sum_labels
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
 
 from jawusd.base.arrays import Array
 from jawusd.base.errors import TrackingError
@@ -99,12 +98,6 @@ def features(pixels: Array, normals: Array, turn_px: float) -> Array:
     return np.hstack([pixels, turn_px * double])
 
 
-def nearest(these: Array, others: Array) -> tuple[Array, NDArray[np.int64]]:
-    """Return, for each feature in `these`, the distance and index of the nearest feature in `others`."""
-    distance, index = cKDTree(others).query(these)
-    return distance, index
-
-
 _FEWEST_FACES = 50  # minimum number of faces of a tooth; smaller pieces are scanning artefacts
 _MOST_TEETH = 120  # maximum number of separate teeth per arch, since the labels of both arches are stored in one byte
 # Strip of faces added where the scan has no gum: number of segments, start as a fraction of the crown height [-], and
@@ -145,14 +138,7 @@ class Outlines:
 
     def take(self, index: NDArray[np.int64]) -> Outlines:
         """Return the points at given indices, which may repeat."""
-        return Outlines(
-            self.points[index],
-            self.arch[index],
-            self.tooth[index],
-            self.pixels[index],
-            self.normals[index],
-            self.gum[index],
-        )
+        return Outlines(*(values[index] for values in vars(self).values()))
 
 
 def split_teeth(scan: Scan, T_anatomical_scan: Array, arch: int) -> Crowns:
@@ -245,8 +231,8 @@ def outlines_of(
         ahead = across @ one.to_gum
         facing = (ahead * normals[own]).sum(1) / np.maximum(np.linalg.norm(ahead, axis=1), 1e-12)
         gum[own] = np.maximum(facing, 0.0)
-    clear = np.linalg.norm(normals, axis=1) > 0
-    return Outlines(points[clear], arch[clear], tooth[clear], pixels[clear], normals[clear], gum[clear])
+    clear = np.flatnonzero(np.linalg.norm(normals, axis=1) > 0)
+    return Outlines(points, arch, tooth, pixels, normals, gum).take(clear)
 
 
 def _ends(depth: NDArray[np.float32], labels: NDArray[np.uint8]) -> tuple[Array, Array, Array, Array]:

@@ -14,7 +14,7 @@ from scipy.ndimage import distance_transform_edt
 from jawusd.base.arrays import Array
 from jawusd.geometry import anatomical_frame, make_transform, se3_inverse, so3_exp
 from jawusd.photographs.drawing import Crowns, Drawing, draw_teeth, outlines_of, split_teeth
-from jawusd.photographs.solve import Aligner, Bite, Contact, Photo, PhotoPose
+from jawusd.photographs.solve import Aligner, Bite, Contact, Photo, PhotoPose, middle_of
 from jawusd.tracking.contour.scan import Scan, thinned
 
 _PX_PER_MM = 2.5
@@ -60,11 +60,6 @@ class TypicalBite:
 
     T_anatomical_upper: Array  # upper scan to (left, up, front) axes, shape (4, 4)
     T_anatomical_lower: Array  # lower scan to the same axes, shape (4, 4)
-
-    @property
-    def frames(self) -> tuple[Array, Array]:
-        """Anatomical poses of both arches, upper first."""
-        return self.T_anatomical_upper, self.T_anatomical_lower
 
     @property
     def T_upper_lower(self) -> Array:
@@ -157,7 +152,7 @@ def _drawn_spectra(drawing: Drawing, size: int) -> Iterator[tuple[float, bool, N
     """Yield for each candidate: field of view [mm], whether mirrored, spectra by direction bin, number of points."""
     for mirrored in (False, True):
         lines = drawing.mirrored() if mirrored else drawing
-        middle = 0.5 * (np.array(drawing.size_px) - 1.0)
+        middle = middle_of(drawing.size_px)
         for width_mm in _WIDTHS_MM:
             pixels = (lines.pixels - middle) * (_PX_PER_MM * width_mm / drawing.size_px[0]) + size / 2
             picture = _by_sector(pixels, lines.normals, size)
@@ -203,8 +198,9 @@ class ArchPair:
     @classmethod
     def of(cls, scans: Sequence[Scan], usual: TypicalBite) -> ArchPair:
         """Split both scans into teeth."""
+        frames = usual.T_anatomical_upper, usual.T_anatomical_lower
         fine, thin = (
-            [split_teeth(scan, T, r) for r, (scan, T) in enumerate(zip(some, usual.frames, strict=True))]
+            [split_teeth(scan, T, r) for r, (scan, T) in enumerate(zip(some, frames, strict=True))]
             for some in (scans, [thinned(scan, _FACES) for scan in scans])
         )
         return cls(usual, (fine[0], fine[1]), (thin[0], thin[1]))
@@ -226,7 +222,7 @@ def find_first(drawing: Drawing, scans: Sequence[Scan], usual: Sequence[TypicalB
     tried = []
     for bite in usual:
         rows = ArchPair.of(scans, bite)
-        found = _aligned_candidates(drawing, rows, rows.usual.T_upper_lower, _CANDIDATES)
+        found = _aligned_candidates(drawing, rows, rows.usual.T_upper_lower)
         tried += [(misfit, mirrored, one, rows) for misfit, mirrored, one in found]
     tried.sort(key=lambda one: one[0])
     ends = []
@@ -255,7 +251,7 @@ def _misfit(aligner: Aligner, bite: Bite) -> float:
 
 def find_next(drawing: Drawing, rows: ArchPair, T_upper_lower: Array, contact: Contact) -> PhotoStart:
     """Return the best start of a photograph, given an approximate bite from another photograph."""
-    found = _aligned_candidates(drawing, rows, T_upper_lower, _CANDIDATES)
+    found = _aligned_candidates(drawing, rows, T_upper_lower)
     aligner = Aligner(rows.thin, rows.usual.T_upper_lower, contact)
     ends = []
     for _, mirrored, one, _ in _finalists([(*entry, rows) for entry in found]):
@@ -264,14 +260,12 @@ def find_next(drawing: Drawing, rows: ArchPair, T_upper_lower: Array, contact: C
     return _best(ends)
 
 
-def _aligned_candidates(
-    drawing: Drawing, rows: ArchPair, T_upper_lower: Array, count: int
-) -> list[tuple[float, bool, Bite]]:
+def _aligned_candidates(drawing: Drawing, rows: ArchPair, T_upper_lower: Array) -> list[tuple[float, bool, Bite]]:
     """Return the misfits, mirrorings and poses of the most promising views after some alignment steps, best first."""
     aligner = Aligner(rows.thin, rows.usual.T_upper_lower, None)
     factor = _WIDTH_PX / drawing.size_px[0]
     out = []
-    for one in searched(drawing, rows.thin, rows.usual, T_upper_lower, count):
+    for one in searched(drawing, rows.thin, rows.usual, T_upper_lower, _CANDIDATES):
         lines = drawing.mirrored() if one.mirrored else drawing
         photo = Photo(lines, PhotoPose(one.T_cam_upper, one.focal_px, 0.0)).shrunk(factor)
         bite = aligner.aligned(Bite((photo,), T_upper_lower, np.zeros(2)), _WIDE_GATES)

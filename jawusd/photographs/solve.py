@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 
 from jawusd.base.arrays import Array
 from jawusd.geometry import orthonormalise, so3_log, transform_point, transform_points
-from jawusd.photographs.drawing import Crowns, Drawing, Outlines, draw_teeth, features, nearest, outlines_of
+from jawusd.photographs.drawing import Crowns, Drawing, Outlines, draw_teeth, features, outlines_of
 from jawusd.tracking.contour.equations import motion_about
 from jawusd.tracking.contour.scan import Scan
 from jawusd.tracking.initialization.occlusion import crown_surface
@@ -156,6 +156,10 @@ class Photo:
     drawing: Drawing
     pose: PhotoPose
 
+    def drawn(self, drawing: Drawing) -> Photo:
+        """Return the photograph with its lines in a drawing of another size."""
+        return Photo(drawing, self.pose.scaled(drawing.size_px[0] / self.drawing.size_px[0]))
+
     def shrunk(self, factor: float) -> Photo:
         """Return the photograph downscaled by a factor."""
         return Photo(self.drawing.shrunk(factor), self.pose.scaled(factor))
@@ -188,7 +192,7 @@ class Match:
 def match(seen: Outlines, drawing: Drawing, turn_px: float) -> Match:
     """Match each drawn point to the nearest outline point, in position and direction."""
     drawn, there = (features(one.pixels, one.normals, turn_px) for one in (drawing, seen))
-    apart, index = nearest(drawn, there)
+    apart, index = cKDTree(there).query(drawn)
     own = seen.take(index)
     return Match(own, ((own.pixels - drawing.pixels) * own.normals).sum(1), apart)
 
