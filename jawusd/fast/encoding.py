@@ -304,10 +304,6 @@ def judge(
         return 0, residual, np.nan
     out, _, _ = signed_distance(bound, e.x[0], e.x[1], e.x[2], v)
     reason = 0 if residual <= residual_limit else _OFF_MODEL
-    return reason | _outside(-out, margin_limit), residual, -out
-
-
-@device
-def _outside(margin: float, margin_limit: float) -> int:
-    """Return the reason code of a margin [mm], 0 if it is within the limit."""
-    return 0 if margin >= margin_limit - ON_BOUND_MM else _OUTSIDE_BOUNDS
+    if -out < margin_limit - ON_BOUND_MM or isnan(out):
+        reason |= _OUTSIDE_BOUNDS
+    return reason, residual, -out

@@ -65,15 +65,8 @@ def _weight(x: float) -> float:
 
 @device
 def signed_distance_gradient(bound: Array, d1: float, d2: float, d3: float, v: Array, gradient: Array) -> float:
-    """Return the signed distance [mm]; write its gradient (3,)."""
+    """Return the signed distance [mm]; write its gradient (3,), the weighted normals of the half-spaces."""
     out, low, high = signed_distance(bound, d1, d2, d3, v)
-    _write_gradient(bound, d1, low, high, v, gradient)
-    return out
-
-
-@device
-def _write_gradient(bound: Array, d1: float, low: float, high: float, v: Array, gradient: Array) -> None:
-    """Write the gradient (3,): the weighted normals of the half-spaces."""
     sides = int(bound[SIDES])
     c, s, _, _ = _support_segment(bound, d1)
     n2, n3 = bound[HULL:], bound[HULL + sides :]
@@ -84,3 +77,4 @@ def _write_gradient(bound: Array, d1: float, low: float, high: float, v: Array, 
             g2 += v[k] * n2[k]
             g3 += v[k] * n3[k]
     gradient[0], gradient[1], gradient[2] = g1, g2, g3
+    return out
