@@ -212,10 +212,7 @@ def naming_file(path: str | PathLike[str]) -> Iterator[None]:
 
 @contextlib.contextmanager
 def explain_missing_packages(extra: str | None = None) -> Iterator[None]:
-    """Name the extra to install when a package is missing; a context manager and decorator.
-
-    Args:
-        extra: the extra that provides all packages used in the block; by default, that of the missing package.
+    """Name the extra to install, by default that of the missing package; a context manager and decorator.
 
     Raises:
         MissingDependencyError: instead of the ModuleNotFoundError.

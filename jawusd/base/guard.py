@@ -260,8 +260,8 @@ _LARGE_BYTES = 8_000_000
 def map_large_arrays() -> None:
     """Make glibc return the memory of arrays above 8 MB to the system as soon as they are freed.
 
-    By default, glibc raises its threshold to the size of the largest block freed so far. The setting applies to the
-    whole process; libraries should not call this.
+    By default, glibc raises its threshold to the size of the largest block freed so far. The setting is process-wide;
+    libraries should not call this.
     """
     if sys.platform == "linux":
         import ctypes

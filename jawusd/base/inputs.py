@@ -71,9 +71,9 @@ def check_path(path: str | os.PathLike[str], error: type[JawusdError]) -> None:
 
 
 def allow_folders(folders: Iterable[str | os.PathLike[str]]) -> None:
-    """Allow stages to reference files in the given folders, besides the folders in the environment variable.
+    """Allow stages to reference files in these folders and those of the environment variable, subfolders included.
 
-    Subfolders are included. The folders of earlier calls are replaced.
+    The folders of earlier calls are replaced.
     """
     _given.set(tuple(Path(folder).resolve() for folder in folders))
 

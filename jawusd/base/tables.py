@@ -36,12 +36,9 @@ _MAYBE_THOUSANDS = re.compile(r"[+-]?[1-9]\d{0,2},\d{3}")
 
 
 def read_text(path: Path, most_bytes: int, encoding: str = "utf-8") -> str:
-    """Return the content of a text file, with LF line ends.
+    """Return the content of a text file of at most `most_bytes`, with LF line ends.
 
-    Args:
-        path: the file.
-        most_bytes: maximum size of the file [bytes].
-        encoding: used unless a byte order mark or null bytes indicate UTF-16 or UTF-32.
+    The encoding is used unless a byte order mark or null bytes indicate UTF-16 or UTF-32.
 
     Raises:
         FormatError: the file is missing, not a regular file, too large, or not text in this encoding.
@@ -93,11 +90,7 @@ class TextTable:
     places: list[str]
 
     def numbers(self, columns: Sequence[int], rows: Sequence[int] | None = None) -> Array:
-        """Return columns as numbers, shape (rows, columns); `nan` and `inf` are kept.
-
-        Args:
-            columns: indices in the header.
-            rows: indices of rows, None for all.
+        """Return columns and rows (default: all), given by index, as numbers, (rows, columns); `nan` and `inf` are kept.
 
         Raises:
             FormatError: a cell is not a number, or the decimal separator is ambiguous.
@@ -115,7 +108,6 @@ def read_table(path: Path, most_bytes: int, comment: str = "#", short_rows: bool
     """Read a text table whose first row names the columns.
 
     Args:
-        path: the file.
         most_bytes: maximum size of the file [bytes].
         comment: prefix of lines to skip.
         short_rows: allow rows to end early; the caller checks them with `check_width`.
@@ -162,8 +154,6 @@ def split_rows(
     """Return the rows of a table with their line numbers, and the separator.
 
     Args:
-        text: the content of the file.
-        path: the file, for messages.
         comment: prefix of lines to skip.
         blank_rows: keep rows of several blank cells, except at the end.
 
@@ -199,12 +189,9 @@ def _separator(text: str, comment: str) -> str:
 
 
 def to_numbers(cells: Sequence[Sequence[str]], named: Callable[[int, int], str], path: Path) -> Array:
-    """Return cells as an array of numbers of the same shape; `nan` and `inf` are kept.
+    """Return cells, in rows of equal length, as an array of numbers; `nan` and `inf` are kept.
 
-    Args:
-        cells: rows of equal length.
-        named: callback that returns the name of a cell for messages, given row and column.
-        path: the file, for messages.
+    `named` returns the name of a cell for messages, given row and column.
 
     Raises:
         FormatError: a cell is not a number, or the decimal separator is ambiguous.

@@ -71,11 +71,7 @@ def load_colmap(folder: str | os.PathLike[str]) -> list[Camera]:
 
 
 def _image_rows(path: Path) -> Iterator[list[str]]:
-    """Yield the words of each image line; a line of points, three numbers per point, may follow an image line.
-
-    Raises:
-        CalibrationError: a line is neither an image nor points.
-    """
+    """Yield the words of each image line; a line of points, three numbers per point, may follow it."""
     after_image = False
     for row in _rows(path):
         # a point is (x, y, ID of the 3D point)

@@ -28,18 +28,14 @@ _OPENGL = np.diag([1.0, -1.0, -1.0])
 
 
 def load_3de(path: Path, sizes: Mapping[str, Size]) -> list[Camera]:
-    """Read the cameras of 3DEqualizer's Nuke export, sorted by name, in the project's unit.
+    """Read the cameras of 3DEqualizer's Nuke export (the script or its folder), sorted by name, in the project's unit.
 
     A camera uses the lens whose node, file or stated name is the camera's name; if there is only one lens, all cameras
-    use it. Without lenses, cameras are pinholes, for undistorted footage.
-
-    Args:
-        path: the Nuke script or its folder.
-        sizes: (width, height) [px] of the images by camera.
+    use it. Without lenses, cameras are pinholes, for undistorted footage. `sizes` has the image sizes by camera.
 
     Raises:
-        CalibrationError: there is no camera, a camera moves or zooms, an image size or distortion model is unknown,
-            or a lens is ambiguous or cannot be approximated by OpenCV's coefficients.
+        CalibrationError: there is no camera, a camera moves or zooms, an image size or distortion model is unknown, or
+            a lens is ambiguous or cannot be approximated by OpenCV's coefficients.
         FormatError: a file cannot be read.
     """
     scripts = [path] if path.is_file() else sorted(path.glob("*.nk"))

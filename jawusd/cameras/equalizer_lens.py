@@ -148,11 +148,7 @@ def _nuke_name(name: str) -> str:
 
 
 def _lens_lines(path: Path) -> list[str] | None:
-    """Return the lines of a lens file; None for other text files.
-
-    Raises:
-        CalibrationError: the file ends like a lens file but has an invalid beginning.
-    """
+    """Return the lines of a lens file; None for other text files; refuse a lens file with an invalid beginning."""
     try:
         lines = [line.strip() for line in read_text(path, _MOST_BYTES).splitlines()]
     except FormatError:
@@ -220,11 +216,9 @@ def opencv_of(
     """Return K (3, 3), OpenCV's coefficients, and a rotation vector (3,) [rad], applied to points before projection.
 
     Args:
-        lens: the lens.
         K: the camera's pinhole matrix [px].
         size: width and height of the camera's image [px].
         back_mm: width and height of the camera's film back.
-        focal_mm: the camera's focal length.
 
     Raises:
         CalibrationError: OpenCV's coefficients approximate the lens with a residual above 0.05 px.
@@ -253,10 +247,7 @@ def opencv_of(
 
 
 def _undistorted(model: str, values: list[float], x: Array, y: Array) -> tuple[Array, Array]:
-    """Undistort points given relative to the lens centre, y up, in units of half the film back diagonal.
-
-    References: "The Standard Models for Lens Distortion in 3DE4"; Lens Distortion Plugin Kit 2.12.
-    """
+    """Undistort points relative to the lens centre, y up, in units of half the film back diagonal (see the module)."""
     xx, yy, xy = x * x, y * y, x * y
     r2 = xx + yy
     if model == _CLASSIC:

@@ -263,9 +263,7 @@ def load_cameras_file(
     """Read cameras from a calibration in any supported format, in file order; lengths in mm, OpenCV axes and pixels.
 
     Args:
-        path: TOML of aniposelib, Pose2Sim or Caliscope; a COLMAP text model (its folder or one of its files);
-            nerfstudio's transforms.json; Metashape XML; RealityScan CSV, or (a folder of) XMP; OpenCV YAML, XML or
-            JSON; or 3DEqualizer's Nuke script (or its folder).
+        path: a file, or the folder of a COLMAP text model, of XMP files or of 3DEqualizer's Nuke script.
         unit_mm: the file's unit of length [mm].
         sizes: (width, height) [px] of the images by camera, for formats without them; see `lacks_sizes`.
 

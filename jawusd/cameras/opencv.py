@@ -46,10 +46,8 @@ _MOST_PX = 1e6
 def load_opencv(paths: list[Path], sizes: Mapping[str, Size]) -> list[Camera]:
     """Read cameras from OpenCV's storage: one file per camera, named after the camera, or files with several cameras.
 
-    Args:
-        paths: the files; values of a camera are merged over all files. If any camera has a pose, cameras without one
-            are ignored.
-        sizes: (width, height) [px] of the images by camera, used if the files do not state them.
+    Values of a camera are merged over all files. If any camera has a pose, cameras without one are ignored. `sizes` has
+    the image sizes by camera, used if the files do not state them.
 
     Raises:
         CalibrationError: a camera lacks intrinsics, pose or size, or a value is wrong.

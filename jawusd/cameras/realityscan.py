@@ -48,11 +48,7 @@ _OPENGL = np.diag([1.0, -1.0, -1.0])
 
 
 def load_realityscan_xmp(folder: Path, sizes: Mapping[str, Size]) -> list[Camera]:
-    """Read the XMP files of a folder; return cameras named after the files, in the files' unit.
-
-    Args:
-        folder: the folder that contains the XMP files.
-        sizes: (width, height) [px] of the images by camera.
+    """Read the XMP files of a folder; return cameras named after the files, in the files' unit; `sizes` by camera.
 
     Raises:
         CalibrationError: a file is not XML, a size is unknown, or a value is missing or wrong.
@@ -90,11 +86,7 @@ def load_realityscan_xmp(folder: Path, sizes: Mapping[str, Size]) -> list[Camera
 
 
 def load_realityscan_csv(path: Path, sizes: Mapping[str, Size]) -> list[Camera]:
-    """Read cameras from RealityScan's camera parameters, named after the images, in the file's unit.
-
-    Args:
-        path: the CSV file.
-        sizes: (width, height) [px] of the images by camera.
+    """Read cameras from RealityScan's camera parameters, named after the images, in the file's unit; `sizes` by camera.
 
     Raises:
         CalibrationError: a column or a size is missing, or a value is not finite.
@@ -129,11 +121,7 @@ def load_realityscan_csv(path: Path, sizes: Mapping[str, Size]) -> list[Camera]:
 def _lens(
     path: Path, name: str, size: Size, f35_mm: float, principal: tuple[float, float], terms: Array
 ) -> tuple[Array, Array]:
-    """Return K (3, 3) and OpenCV's coefficients from RealityScan's values; `terms` are k1 k2 k3 k4 t1 t2.
-
-    Raises:
-        CalibrationError: the focal length is not positive, or OpenCV's coefficients cannot approximate the lens.
-    """
+    """Return K (3, 3) and OpenCV's coefficients from RealityScan's values; `terms` are k1 k2 k3 k4 t1 t2."""
     longer = max(size)
     if not f35_mm > 0:
         raise CalibrationError(f"camera {name} has focal length {f35_mm:g} mm; it must be > 0.", path=path)

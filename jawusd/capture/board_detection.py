@@ -45,9 +45,8 @@ def detector(boards: Boards) -> Search:
 def different_board(images: Sequence[NDArray[np.uint8]], boards: Boards, missed: bool) -> str | None:
     """Describe the board in gray images (h, w) if it differs from the board of [boards], otherwise return None.
 
-    Args:
-        missed: whether the board of [boards] was missed in most images of the clip; only then are absent markers
-            evidence of a smaller board.
+    Absent markers are evidence of a smaller board only if the board of [boards] was `missed` in most images of the
+    clip.
     """
     (cols, rows), times = _common_chessboard(images)
     described = f"{boards.cols} x {boards.rows}"
@@ -213,9 +212,7 @@ def edge_width_px(image: NDArray[np.uint8], corners_px: Array, cols: int) -> flo
 
     An edge of contrast C blurred by a Gaussian of standard deviation sigma has the gradient energy C^2 / (2 sigma
     sqrt(pi)) per edge length; a chessboard with cell sides a and b has the edge length (|a| + |b|) / |a x b| per area.
-
-    Args:
-        corners_px: corners row by row, `cols` per row, NaN where hidden, shape (N, 2).
+    The corners (N, 2) are listed row by row, `cols` per row, NaN where hidden.
     """
     grid = corners_px.reshape(-1, cols, 2)
     along, down = np.nanmean(np.diff(grid, axis=1), axis=(0, 1)), np.nanmean(np.diff(grid, axis=0), axis=(0, 1))

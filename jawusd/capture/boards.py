@@ -46,8 +46,7 @@ def board_points(boards: Boards) -> Array:
 def board_symmetries(boards: Boards) -> list[NDArray[np.int64]]:
     """Return the orders in which a detector may list the N corners of a board, as permutations of shape (N,).
 
-    A chessboard has a two-fold symmetry, a square chessboard a four-fold one. ChArUco corners are numbered, so
-    their order is known.
+    A chessboard has a two-fold symmetry, a square one a four-fold one. ChArUco corners are numbered.
     """
     grid = np.arange(boards.cols * boards.rows).reshape(boards.rows, boards.cols)
     if boards.pattern == "charuco":

@@ -111,8 +111,8 @@ class _Problem:
     def solve(self, x: Array) -> Array:
         """Return the unknowns that minimise the robust error (reweighted Levenberg-Marquardt; Triggs et al. 2000).
 
-        The normal equations are formed from the sparse Jacobian and solved densely. Iterative solvers converge slowly,
-        since focal length and distance are strongly correlated.
+        The normal equations are solved densely: iterative solvers converge slowly, as focal length and distance are
+        strongly correlated.
         """
         for _ in range(2):  # the second run uses the residual scale found in the first run
             scale = _HUBER_SIGMAS * max(_LEAST_SIGMA_PX, 1.4826 * float(np.median(np.abs(self.residuals(x)))))
@@ -178,11 +178,10 @@ class _Problem:
         return sigma**2 * inverse[:own, :own]
 
     def _camera(self, x: Array, turns: Array, c: int) -> tuple[Array, Array, Array, Array]:
-        """Project the n observed points of one camera, in the order of the views, given the board rotations (V, 3, 3).
+        """Project the n points that camera c sees, given the board rotations (V, 3, 3).
 
-        Returns:
-            Residuals (2n,), OpenCV's derivative of the pixels (2n, ...), and the points after the board and the camera
-            rotation, (n, 3) each.
+        Return residuals (2n,), OpenCV's derivative of the pixels (2n, ...), and the points after the board and the
+        camera rotation, (n, 3) each, in the order of the views.
         """
         cameras, boards = self.split(x)
         lens, pose = cameras[c * _LENS : (c + 1) * _LENS], self._pose(x, c)
@@ -199,8 +198,7 @@ class _Problem:
     def _parts(self, x: Array, turns: Array, slopes: Array, c: int) -> list[tuple[Array | int, Array]]:
         """Return blocks (2n, 6) of one camera's Jacobian, each with its column offset, for all rows or per row.
 
-        Args:
-            turns, slopes: rotations of the boards and their left Jacobians, shape (V, 3, 3).
+        `turns` and `slopes` (V, 3, 3) are the rotations of the boards and their left Jacobians.
         """
         pose, views = self._pose(x, c), self.points[c][0]
         _, J, turned, carried = self._camera(x, turns, c)

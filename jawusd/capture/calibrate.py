@@ -76,8 +76,7 @@ def calibrate_capture(
 
     Args:
         scans: vertices of the teeth scans [mm] by "upper" and "lower", shape (n, 3); picked points are indices of them.
-        scale_without_picks: measures the size of the teeth with the calibrated cameras if the picked points are too
-            few.
+        scale_without_picks: measures the size of the teeth if the picked points are too few.
 
     Raises:
         CalibrationError: there are no boards, or the boards do not determine the calibration.

@@ -155,7 +155,7 @@ def swapped_cameras(
     Args:
         ranges: first and last frame with masks, by camera.
         offsets: frame number of the reference camera minus that of the camera at the same time, by camera.
-        first, stop: first frame of the take, and one past the last, in frame numbers of the reference camera.
+        first, stop: range of the take, in frame numbers of the reference camera.
     """
 
     def fits(source: str, camera: str) -> bool:
@@ -168,13 +168,9 @@ def swapped_cameras(
 
 
 def centre_findings(cameras: Mapping[str, Camera], centres: Sequence[Sequence[MaskCentres]]) -> Iterator[Finding]:
-    """Yield findings about cameras whose mask centres contradict those of other cameras.
+    """Yield a finding about the camera whose mask centres contradict those of the most other cameras.
 
-    Args:
-        cameras: calibrated cameras by name.
-        centres: mask centres in some frames, one entry per candidate time offset; the best candidate is used.
-
-    The camera that is part of the most inconsistent pairs is reported.
+    `centres` has the mask centres in some frames, one entry per candidate time offset; the best candidate is used.
     """
     apart: dict[tuple[str, str], float] = {}
     for pair in combinations(cameras, 2):
@@ -206,9 +202,7 @@ def centre_findings(cameras: Mapping[str, Camera], centres: Sequence[Sequence[Ma
 def width_findings(cameras: Mapping[str, Camera], pixels: Mapping[str, Array]) -> Iterator[Finding]:
     """Yield findings about masks whose width at the triangulated depth is implausible for teeth.
 
-    Args:
-        cameras: calibrated cameras by name.
-        pixels: some teeth pixels of one video frame, by camera, shape (N, 2).
+    `pixels` (N, 2) has some teeth pixels of one video frame by camera.
     """
     seen = {name: camera for name, camera in cameras.items() if len(pixels.get(name, ()))}
     if len(seen) < 2:

@@ -56,8 +56,7 @@ def check_scale(
 ) -> ScaleCheck:
     """Compare the spread of triangulated picked points with their spread on the scans (Umeyama 1991).
 
-    Args:
-        scans: vertices [mm] by "upper" and "lower", shape (n, 3).
+    `scans` has the vertices (n, 3) [mm] by "upper" and "lower".
 
     Raises:
         CalibrationError: the measured size of the teeth differs from the scan.
@@ -121,12 +120,7 @@ def mouth_centre(cameras: list[Camera], bootstrap: Bootstrap | None, T_world_boa
 
 
 def board_shape_error(cameras: list[Camera], bundle: Bundle, points_mm: Array, centre_mm: Array) -> ShapeError:
-    """Compare distances between triangulated corners near the mouth with those on the board.
-
-    Args:
-        points_mm: corners on the board, shape (N, 3).
-        centre_mm: centre of the mouth in world coordinates, shape (3,).
-    """
+    """Compare distances of corners near the mouth centre (3,) [mm, world] with those on the board (N, 3) [mm]."""
     errors = []
     for corners in np.moveaxis(bundle.corners_px, 1, 0):
         enough = np.isfinite(corners[..., 0]).sum(0) >= 2
@@ -145,7 +139,7 @@ def expected_shape_error(cameras: list[Camera], bundle: Bundle, centre_mm: Array
     """Return the mean error of distances in the mouth [mm] that the covariance of the cameras implies.
 
     Points in the mouth are projected with the calibrated cameras and triangulated with cameras drawn from the
-    covariance. Effects that the model omits (bent boards, other lens terms, rolling shutter) are not included.
+    covariance. Bent boards, other lens terms and rolling shutter are not included.
     """
     rng = np.random.default_rng(0)
     direction = rng.normal(size=(_POINTS, 3))
@@ -172,8 +166,8 @@ def distance_errors(found: Array, exact: Array) -> Array:
 def _triangulate(cameras: list[Camera], pixels: Array) -> Array:
     """Triangulate points (M, 3) linearly from distorted pixels (C, M, 2), NaN where hidden.
 
-    The method is the inhomogeneous one, in normalised coordinates (Hartley & Zisserman, section 12.2). If the cameras
-    are at similar distances, its algebraic error approximates the reprojection error.
+    The inhomogeneous method in normalised coordinates (Hartley & Zisserman, section 12.2): if the cameras are at
+    similar distances, its algebraic error approximates the reprojection error.
     """
     rows, right = [], []
     for camera, seen in zip(cameras, pixels):

@@ -61,11 +61,7 @@ class Offset:
 
 
 def find_steps(brightness: Array, first_frame: int = 0) -> list[Step]:
-    """Return the light steps in temporal order; none if no change is as large as that of a flash.
-
-    Args:
-        brightness: mean brightness of successive images, 0 to 255, shape (n,).
-    """
+    """Return the light steps in the brightness (n,) of successive images, 0 to 255; none if all changes are small."""
     if len(brightness) < 2 or brightness.max() - brightness.min() < _CONTRAST * brightness.max():
         return []
     contrast = brightness.max() - brightness.min()

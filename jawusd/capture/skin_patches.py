@@ -45,13 +45,9 @@ class SkinView:
 def followed(
     before: Gray, after: Gray, points: Array, side_px: int, guess: Array | None = None, levels: int = _LEVELS
 ) -> tuple[Array, Mask]:
-    """Follow points (N, 2) [px] from one image to another and back.
+    """Follow points (N, 2) [px] from one image to another, near a guess (N, 2), by default where they were, and back.
 
-    Args:
-        guess: where the points are expected, shape (N, 2); default: where they were.
-
-    Returns:
-        Positions (N, 2) [px], and which points (N,) come back to where they started.
+    Return positions (N, 2) [px], and which points (N,) come back to where they started.
     """
     if not len(points):
         return points.copy(), np.zeros(0, bool)

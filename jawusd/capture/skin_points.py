@@ -53,7 +53,6 @@ class SkinTracker:
         """Find points in the key frame.
 
         Args:
-            cameras: calibrated cameras.
             images: recorded images of the key frame by camera name.
             T_world_mouth: pose of the anatomical axes (left, up, front) at the incisal point, shape (4, 4).
             opening_mm: height of the upper above the lower incisal point.
@@ -107,10 +106,7 @@ class SkinTracker:
         return float(np.arccos(np.clip(axes[0] @ axes[1], -1, 1)))
 
     def _across(self, a: int, b: int, points: Array, T_world_mouth: Array) -> Array:
-        """Return where points (n, 2) of camera `a` are in camera `b` [px], NaN where they are not recognised.
-
-        The image of `b` is warped to that of `a` by the planes that approximate the skin.
-        """
+        """Return where points (n, 2) of camera `a` are in camera `b` [px], by planes near the skin; NaN if nowhere."""
         view, other = self._views[a], self._views[b]
         whole = np.rint(points).astype(int)
         key, best = Patches(self._key[a], view.side_px), np.full(len(points), _ALIKE_ACROSS)
@@ -137,7 +133,7 @@ class SkinTracker:
     def placed(self, pixels: Array) -> tuple[Array, Array]:
         """Triangulate points with working pixels (C, N, 2); return positions (N, 3) [mm], and the consistent pixels.
 
-        Points that fewer than two cameras see, or whose pixels are inconsistent, are NaN.
+        Points that fewer than two cameras see consistently are NaN.
         """
         kept = pixels.copy()
         for _ in range(max(len(pixels) - 1, 1)):
@@ -206,7 +202,7 @@ def _projected(matrices: Array, points: Array) -> Array:
 def _triangulated(matrices: Array, pixels: Array) -> Array:
     """Return points (N, 3) [mm] from pixels (C, N, 2), NaN where fewer than two cameras see one.
 
-    The linear estimate with rows reweighted by depth (Hartley and Sturm 1997, section 4), for many points at once.
+    The linear estimate with rows reweighted by depth (Hartley and Sturm 1997, section 4).
     """
     out = np.full((pixels.shape[1], 3), np.nan)
     known = np.isfinite(pixels[..., 0]).sum(axis=0) >= 2
@@ -227,12 +223,9 @@ def _triangulated(matrices: Array, pixels: Array) -> Array:
 
 
 def _from_neighbours(start: Array, moved: Array, good: Mask, lost: Indices) -> Array:
-    """Return where points of the key frame (N, 2) are expected if they move like their neighbours, shape (L, 2).
+    """Return where `lost` points (L,) are expected if they move like their `good` neighbours (N,), shape (L, 2).
 
-    Args:
-        start, moved: positions in the key frame and in the image, shape (N, 2) each.
-        good: points whose position in the image is reliable, shape (N,).
-        lost: indices of the other points, shape (L,).
+    `start` and `moved` (N, 2) are positions in the key frame and in the image.
     """
     known = np.flatnonzero(good)
     if len(known) < _AROUND:

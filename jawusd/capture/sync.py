@@ -88,8 +88,8 @@ def estimate_offsets(capture: Capture) -> Alignment:
 def align_videos(videos: Mapping[str, Path | ClipSource], reference: str, *, by_light: bool = True) -> Alignment:
     """Synchronise videos with the reference camera by light flashes or sound.
 
-    First, only the start and the end of each video are decoded, then more until flashes are found. If a video has no
-    flash, or if `by_light` is false, sound is used, which all videos must then have.
+    Decode the start and the end of each video, then more until flashes are found. If a video has no flash, or
+    `by_light` is false, use the sound, which all videos must then have.
 
     Raises:
         SyncError: the videos have neither light flashes nor sound, frame rates differ, or the signals do not match.

@@ -41,14 +41,11 @@ _CELL_MM, _MIN_CELLS = 4.0, 6
 
 
 def anatomical_frame(upper_vertices: ArrayLike, lower_vertices: ArrayLike) -> Array:
-    """Return T_anatomical_skull (4, 4) of two dental scans in occlusion, in any common scan frame.
+    """Return T_anatomical_skull (4, 4) from the crown vertices (N, 3) and (M, 3) [mm] of two dental scans in occlusion.
 
-    Up is the normal of the common plane of both arches, from the lower to the upper one; the midline is the mirror
-    axis of the arches in that plane; anterior is the side of the closed end of the horseshoe-shaped arches. Teeth
-    may be missing.
-
-    Args:
-        upper_vertices, lower_vertices: crown vertices [mm], shapes (N, 3) and (M, 3).
+    Up is the normal of the common plane of both arches, from the lower to the upper one; the midline is the mirror axis
+    of the arches in that plane; anterior is the side of the closed end of the horseshoe-shaped arches. Teeth may be
+    missing.
     """
     upper, lower = np.asarray(upper_vertices, dtype=np.float64), np.asarray(lower_vertices, dtype=np.float64)
     both = np.concatenate([_thin(upper), _thin(lower)])
@@ -73,13 +70,10 @@ def anatomical_frame(upper_vertices: ArrayLike, lower_vertices: ArrayLike) -> Ar
 
 
 def bite_normal(upper_vertices: ArrayLike, lower_vertices: ArrayLike) -> Array:
-    """Return the normal of the common plane of two arches in occlusion, from the lower to the upper one, shape (3,).
+    """Return the normal (3,) of the common plane of two arches in occlusion, from the lower to the upper one.
 
-    The sign is decided by local heights, in cells where crowns of both arches overlap. Mean heights of whole arches are
-    misleading with missing, short or deeply overlapping teeth.
-
-    Args:
-        upper_vertices, lower_vertices: crown vertices [mm], shapes (N, 3) and (M, 3).
+    The sign is decided by local heights of the crown vertices (N, 3) and (M, 3) [mm], in cells where both arches
+    overlap. Mean heights of whole arches mislead with missing, short or deeply overlapping teeth.
     """
     upper, lower = _thin(np.asarray(upper_vertices, np.float64)), _thin(np.asarray(lower_vertices, np.float64))
     e1, e2, normal = np.linalg.svd(np.concatenate([upper - upper.mean(0), lower - lower.mean(0)]), full_matrices=False)[
@@ -99,10 +93,8 @@ def bite_normal(upper_vertices: ArrayLike, lower_vertices: ArrayLike) -> Array:
 def _front_edge(crown: Array, side: float, within_mm: float) -> Array:
     """Return the points of the incisal edge near the midline, or of the nearest teeth if incisors are missing.
 
-    Args:
-        crown: Crown points, x from the midline, y up, z anterior [mm], shape (N, 3).
-        side: 1 if the edge is the upper end of the crowns, -1 if the lower one.
-        within_mm: Largest height difference from the outermost point of the edge.
+    Crowns are x from the midline, y up, z anterior [mm], (N, 3). The edge is their upper end if `side` is 1, the lower
+    one if -1, within a height difference from the outermost point.
     """
     reach = max(_MIDLINE_MM, float(np.sort(np.abs(crown[:, 0]))[min(_MIN_FRONT, len(crown) - 1)]))
     front = crown[np.abs(crown[:, 0]) <= reach]
@@ -112,14 +104,10 @@ def _front_edge(crown: Array, side: float, within_mm: float) -> Array:
 
 
 def _centre_midline(points: Array, R: Array) -> tuple[Array, float]:
-    """Rotate the lateral axis until the line midway between the buccal outlines is sagittal.
+    """Rotate the lateral axis until the line midway between the buccal outlines of points (N, 3) [mm] is sagittal.
 
-    Args:
-        points: crown vertices [mm], shape (N, 3).
-        R: Initial left, up and anterior axes as rows, shape (3, 3).
-
-    Returns:
-        The corrected rotation (3, 3) and the lateral coordinate of the midline [mm].
+    R (3, 3) has the initial left, up and anterior axes as rows. Return the corrected R and the midline's lateral
+    coordinate.
     """
     midline = float(np.percentile(points @ R[0], [2, 98]).mean())
     for _ in range(8):
@@ -216,12 +204,9 @@ def _mean_condyles(incisor: Array, arch_width_mm: float) -> Array:
 
 
 def landmark_frame(landmarks: ArrayLike) -> Array:
-    """Return the transform (4, 4) from the landmarks' frame to an anatomical frame defined by the landmarks alone.
+    """Return the transform (4, 4) from the frame of the landmarks (5, 3) [mm] to an anatomical frame defined by them.
 
     The occlusal plane contains the incisal point and the molars; the origin is the lower incisal point.
-
-    Args:
-        landmarks: in the order of `LANDMARKS`, teeth in occlusion [mm], shape (5, 3).
     """
     incisor, molar_left, molar_right = np.asarray(landmarks, dtype=np.float64)[:3]
     forward = incisor - 0.5 * (molar_left + molar_right)

@@ -100,10 +100,7 @@ class Camera:
         return replace(self, size_px=(int(size_px[0]), int(size_px[1])), K=K)
 
     def cropped(self, x0_px: int, y0_px: int, size_px: tuple[int, int]) -> Camera:
-        """Return the camera for a crop with width and height ``size_px`` and first pixel (x0_px, y0_px).
-
-        Distortion stays exact, since it acts on normalised coordinates.
-        """
+        """Return the camera for a crop with width and height ``size_px`` and first pixel (x0_px, y0_px)."""
         K = self.K.copy()
         K[0, 2] -= x0_px
         K[1, 2] -= y0_px
@@ -155,15 +152,8 @@ _ROUNDS, _MAX_DAMPING = 200, 1e12
 def opencv_radial(K: Array, size_px: tuple[int, int], radial: Array) -> tuple[Array, float]:
     """Return OpenCV's radial coefficients k1, k2, k3[, k4, k5, k6] of 1 + a1 r^2 + a2 r^4 + a3 r^6 + a4 r^8.
 
-    With a fourth term, a ratio of two polynomials is fitted over the image.
-
-    Args:
-        K: intrinsic matrix (3, 3) [px].
-        size_px: width and height.
-        radial: a1, a2, a3 and a4, shape (4,).
-
-    Returns:
-        The coefficients, shape (3,) or (6,), and their largest error [px].
+    With a fourth term, a ratio of two polynomials is fitted over the image. Return the coefficients, (3,) or (6,), and
+    their largest error [px].
     """
     if radial[3] == 0:
         return radial[:3].copy(), 0.0
@@ -184,11 +174,9 @@ def opencv_lens(K: Array, recorded_px: Array, ideal: Array) -> tuple[Array, Arra
     """Fit K and OpenCV's eight coefficients to a lens that is given by distorted and undistorted points.
 
     K is kept if the coefficients alone fit the lens. Otherwise K is fitted too, which covers linear effects such as an
-    anamorphic squeeze. If that is not sufficient, the camera rotation is fitted too, which together with the principal
-    point moves the centre of distortion.
+    anamorphic squeeze; then the camera rotation, which with the principal point moves the centre of distortion.
 
     Args:
-        K: Initial intrinsic matrix (3, 3) [px].
         recorded_px: Points of the recorded image (N, 2) [px].
         ideal: The same points without distortion, on the plane at depth 1, x right, y down, shape (N, 2).
 

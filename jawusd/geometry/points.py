@@ -117,8 +117,8 @@ _PROBES = 60
 def match_points(source: Array, moved: Array, chosen: NDArray[np.int64], farthest: float) -> NDArray[np.int64] | None:
     """Return the points of a moved and scaled copy of a shape that correspond to chosen points of the shape.
 
-    The principal axes of both are aligned, which leaves four rotations by half turns. The rotation that fits is used;
-    if several fit, as for symmetric shapes, the rotation that best preserves the order of the points.
+    The principal axes of both are aligned, which leaves four rotations by half turns. The one that fits is used; if
+    several fit, as for symmetric shapes, the one that best preserves the order of the points.
 
     Args:
         source: Points of the shape, shape (N, 3); duplicates count once.
@@ -172,13 +172,9 @@ def _nearest(wanted: Array, points: Array, farthest: float) -> NDArray[np.int64]
 
 
 def welded(points: NDArray[_Number]) -> tuple[NDArray[_Number], NDArray[np.int64]]:
-    """Return the distinct points and the index of each point, four times as fast as `numpy.unique` over rows.
+    """Return the distinct ones of finite points (n, k) in lexicographic order, (m, k), and indices into them, (n,).
 
-    Args:
-        points: Finite points, shape (n, k).
-
-    Returns:
-        The distinct points in lexicographic order, shape (m, k), and indices into them, shape (n,).
+    This is four times as fast as `numpy.unique` over rows.
     """
     order = np.lexsort(points.T[::-1])
     sorted_points = points[order]

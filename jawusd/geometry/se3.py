@@ -33,10 +33,7 @@ def se3_inverse(T: ArrayLike) -> Array:
 
 
 def transform_point(T: ArrayLike, p: ArrayLike) -> Array:
-    """Apply transforms (..., 4, 4) to points (..., 3) [mm], one each, ``p_a = T_a_b p_b``, shape (..., 3).
-
-    The leading axes are broadcast.
-    """
+    """Apply transforms (..., 4, 4) to points (..., 3) [mm], one each, ``p_a = T_a_b p_b``, broadcasting both."""
     T, p = np.asarray(T, dtype=np.float64), np.asarray(p, dtype=np.float64)
     return np.einsum("...ij,...j->...i", T[..., :3, :3], p) + T[..., :3, 3]
 
@@ -56,10 +53,7 @@ def transform_points(T: ArrayLike, points: ArrayLike) -> Array:
 
 
 def relative_pose(T_world_upper: ArrayLike, T_world_lower: ArrayLike) -> Array:
-    """Return the jaw pose T_skull_mandible from the world poses of the upper and lower teeth (Yang et al. eqs. 1-3).
-
-    All poses have shape (..., 4, 4).
-    """
+    """Return T_skull_mandible from the world poses (..., 4, 4) of the upper and lower teeth (Yang et al. eqs. 1-3)."""
     return se3_inverse(T_world_upper) @ np.asarray(T_world_lower, dtype=np.float64)
 
 

@@ -39,10 +39,7 @@ def wxyz_from_matrix(R: ArrayLike) -> Array:
 
 
 def _multiples(R: Sequence[Sequence[N]] | Array) -> list[list[N]]:
-    """Return 4 q q^T from rows of matrix entries, floats or arrays. Every row is a multiple of q.
-
-    The row with the largest diagonal entry is free of cancellation.
-    """
+    """Return 4 q q^T from rows of matrix entries; the row with the largest diagonal entry is free of cancellation."""
     a, b, c = R[0][0], R[1][1], R[2][2]
     x, y, z = R[2][1] - R[1][2], R[0][2] - R[2][0], R[1][0] - R[0][1]
     xy, xz, yz = R[1][0] + R[0][1], R[0][2] + R[2][0], R[2][1] + R[1][2]
@@ -56,10 +53,7 @@ def _multiples(R: Sequence[Sequence[N]] | Array) -> list[list[N]]:
 
 
 def continuous_wxyz(R: ArrayLike) -> Array:
-    """Return the unit quaternions (n, 4) of rotations (n, 3, 3), with signs chosen for continuity.
-
-    Slerp takes the shorter arc between two samples, but readers that interpolate the four components do not.
-    """
+    """Return the unit quaternions (n, 4) of rotations (n, 3, 3), of continuous sign for interpolation by component."""
     wxyz = wxyz_from_matrix(R)
     if len(wxyz) > 1:
         turn = np.where(np.einsum("ij,ij->i", wxyz[1:], wxyz[:-1]) < 0, -1.0, 1.0)

@@ -42,13 +42,10 @@ class JointShape:
 
 
 def eminence_path(joint: JointShape, side: int, slide_mm: ArrayLike) -> Array:
-    """Return the height of a condyle centre relative to rest [mm], negative down the eminence.
+    """Return the height of a condyle centre (side 0 left, 1 right) relative to rest [mm], negative down the eminence.
 
     The section is an S curve in closed form (concave fossa, slope, convex crest), flat far in front and behind.
-
-    Args:
-        side: 0 left, 1 right.
-        slide_mm: forward distance of the condyle from rest, any shape.
+    `slide_mm` is the forward distance of the condyle from rest, any shape.
     """
     slide = np.asarray(slide_mm, dtype=np.float64)
     start, width = joint.eminence_start_mm[side], joint.eminence_width_mm[side]
@@ -58,8 +55,7 @@ def eminence_path(joint: JointShape, side: int, slide_mm: ArrayLike) -> Array:
 def build_mandible(joint: JointShape, arch: tuple[float, float] = (1.0, 1.0)) -> Mesh:
     """Build the mandible without teeth from overlapping watertight parts: body, rami, coronoid processes, condyles.
 
-    Args:
-        arch: width and length of the dental arch relative to the mean arch.
+    `arch` is the width and length of the dental arch relative to the mean arch.
     """
     parts = [_body(joint, arch)]
     for side, centre in zip((1.0, -1.0), joint.condyles, strict=True):
@@ -70,9 +66,7 @@ def build_mandible(joint: JointShape, arch: tuple[float, float] = (1.0, 1.0)) ->
 def build_skull(joint: JointShape, arch: tuple[float, float] = (1.0, 1.0), *, whole: bool = False) -> Mesh:
     """Build the skull from overlapping watertight parts: joint sockets, cheekbones and upper jaw bone.
 
-    Args:
-        arch: as for `build_mandible`.
-        whole: whether to add nose, rims of the orbits and braincase.
+    `arch` is as for `build_mandible`; `whole` adds nose, rims of the orbits and braincase.
     """
     parts = [_maxilla(joint, arch), *(_upper_skull(joint) if whole else ())]
     for k, side in enumerate((1.0, -1.0)):

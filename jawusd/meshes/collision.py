@@ -62,8 +62,8 @@ class Pair:
     def depth(self, T_upper_lower: Array) -> Array:
         """Return the penetration depth of the surfaces [mm], shape (n,), in poses (n, 4, 4).
 
-        The depth is the largest distance that a surface point of one solid has to the surface of the other solid while
-        inside it. For separate surfaces the depth is negative, down to -`FARTHEST_MM`.
+        It is the largest distance of a surface point inside the other solid from that solid's surface. For separate
+        surfaces it is negative, down to -`FARTHEST_MM`.
         """
         return self._deepest(T_upper_lower, -FARTHEST_MM, np.inf)
 

@@ -59,7 +59,6 @@ class Teeth:
     """Both dental arches in the anatomical frame, the lower one in the closed bite.
 
     Attributes:
-        pair: Both arches as solids.
         closed_mm: Penetration depth in the closed bite; negative for a gap.
         T_anatomical_skull: Skull to anatomical coordinates, shape (4, 4).
         T_rest: T_skull_mandible of the closed bite, shape (4, 4).
@@ -77,11 +76,7 @@ class Teeth:
 
 
 def find_teeth(upper: Mesh, lower: Mesh, T_anatomical_skull: Array, T_rest: Array) -> Teeth:
-    """Return both dental arches as solids.
-
-    Args:
-        upper: Upper scan, skull frame [mm].
-        lower: Lower scan, mandible frame [mm].
+    """Return both dental arches as solids; the upper scan is in the skull frame, the lower in the mandible frame [mm].
 
     Raises:
         NoContact: A scan is too coarse or inconsistently wound, or the arches are too far apart or overlap too much.
@@ -130,8 +125,6 @@ def sample_field(
     """Sample the clearance on a grid of poses over a rig's bound, with a finer step where surfaces are close.
 
     Args:
-        surfaces: The opposing surfaces.
-        rig: The rig.
         step_mm: Grid step where surfaces are close; elsewhere, the step is twice as large.
         most_opening_mm: Largest sampled opening; smaller if the surfaces separate earlier.
     """

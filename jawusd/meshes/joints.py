@@ -55,10 +55,7 @@ class Joints:
         return float(self.closed.max())
 
     def clearances(self, T_skull_mandible: Array) -> Array:
-        """Return the smaller clearance of the two condyles [mm], shape (n,), in poses (n, 4, 4).
-
-        It is negative where a condyle penetrates the skull deeper than in the closed bite.
-        """
+        """Return the smaller clearance of the condyles [mm], (n,), in poses (n, 4, 4), relative to the closed bite."""
         A = self.T_anatomical_skull
         T = A @ T_skull_mandible @ se3_inverse(A @ self.T_rest)
         left, right = (max(closed, 0.0) - pair.depth(T) for pair, closed in zip(self.pairs, self.closed))
@@ -66,12 +63,7 @@ class Joints:
 
 
 def find_joints(skull: Mesh, mandible: Mesh, landmarks: Array, T_anatomical_skull: Array, T_rest: Array) -> Joints:
-    """Return both jaw joints as solids.
-
-    Args:
-        skull: Mesh of the skull, skull frame [mm].
-        mandible: Mesh of the mandible, mandible frame [mm].
-        landmarks: `geometry.LANDMARKS` in the mandible frame [mm], shape (5, 3).
+    """Return both jaw joints as solids, given both bones and `geometry.LANDMARKS` (5, 3) in their own frames [mm].
 
     Raises:
         NoContact: Bone is missing at the condyles or around them, a mesh is too coarse, or a condyle is too far from

@@ -37,8 +37,8 @@ def load_mesh(path: str | os.PathLike[str], kind: Literal["scan", "bone"] = "sca
     """Read a triangle mesh [mm] from PLY, STL, OBJ or 3Shape DCM; vertices keep the order of the file.
 
     Polygons are triangulated; STL files give three vertices per triangle. Texture coordinates are read from OBJ and
-    PLY; materials and textures are ignored. Closed meshes that are inside out are flipped. Unused vertices keep
-    their index but move to the position of a used one. `kind`, teeth scan or bone, determines the accepted sizes.
+    PLY; materials and textures are ignored. Closed meshes that are inside out are flipped. Unused vertices keep their
+    index but move to the position of a used one. `kind` determines the accepted sizes.
 
     Raises:
         CaptureError: the file is missing, damaged, truncated or too large, has no triangles or non-finite coordinates,
@@ -67,11 +67,7 @@ def load_mesh(path: str | os.PathLike[str], kind: Literal["scan", "bone"] = "sca
 
 @explain_missing_packages("dcm")
 def _read_dcm(path: Path) -> MeshData:
-    """Read a 3Shape DCM scan; vertex colours come from its texture.
-
-    Raises:
-        CaptureError: the file is damaged.
-    """
+    """Read a 3Shape DCM scan; vertex colours come from its texture."""
     import open3sdcm
 
     try:
@@ -150,11 +146,10 @@ class Winding(NamedTuple):
 
 
 def winding(mesh: Mesh) -> Winding:
-    """Determine whether a mesh is closed and how its triangles are wound.
+    """Determine whether a mesh is closed and how its triangles are wound; coincident vertices count as one.
 
     The signed volume is the sum of the tetrahedra over the triangles with the centroid as apex (C. Zhang, T. Chen,
-    "Efficient feature extraction for 2D/3D objects in mesh representation", ICIP 2001). Coincident vertices count as
-    one.
+    "Efficient feature extraction for 2D/3D objects in mesh representation", ICIP 2001).
     """
     places, index = welded(mesh.vertices)
     faces = index[mesh.faces]

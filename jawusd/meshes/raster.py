@@ -68,10 +68,7 @@ def project(vertices: Singles, matrix: Singles, out: Singles) -> None:
 
 @numba.njit(nogil=True, cache=True)
 def _hidden(points: Singles, a: int, b: int, c: int, cull: bool) -> bool:
-    """Return whether a triangle is skipped because it touches the camera plane or, with `cull`, is a back face.
-
-    With y down, a counter-clockwise face seen from the front has a negative signed area.
-    """
+    """Return whether a triangle touches the camera plane or, with `cull`, is a back face (area >= 0, as y is down)."""
     if not (points[a, 2] > _MIN_DEPTH and points[b, 2] > _MIN_DEPTH and points[c, 2] > _MIN_DEPTH):
         return True
     if not cull:
@@ -107,7 +104,7 @@ def _edges(points: Singles, a: int, b: int, c: int) -> _Edges:
 def _interval(low: float, high: float, first: int, last: int) -> tuple[int, int]:
     """Return the first and last integer (i, j) in both [low, high] and [first, last]; i > j if none, or for NaN.
 
-    Values are clamped as floats first, since casting a NaN or a huge coordinate to an integer is undefined.
+    Values are clamped as floats first: casting a NaN or a huge coordinate to an integer is undefined.
     """
     i = np.ceil(low)
     j = np.floor(high)

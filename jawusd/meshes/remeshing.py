@@ -38,10 +38,9 @@ def decimated(vertices: Array, faces: NDArray[np.int32], count: int) -> tuple[Ar
 
 
 def proxy_of(mesh: Mesh, count: int) -> Mesh:
-    """Return a scan decimated to about `count` faces, plus one per border edge, with crowns and gum kept separate.
+    """Return a scan decimated to about `count` faces, plus one per border edge, with labels of crown and gum only.
 
-    Borders are preserved, including the one between crown and gum. The result has labels of crown and gum, but no
-    colours or texture coordinates.
+    Borders are preserved, including the one between crown and gum.
     """
     crown = crown_face_mask(mesh)
     parts = []

@@ -45,12 +45,10 @@ class Tops:
 
 
 def biting_direction(points: Array, towards: Array | None) -> Array:
-    """Return the direction in which the crowns of a dental arch point, shape (3,).
+    """Return the direction in which the crowns of a dental arch with vertices (v, 3) point, shape (3,).
 
-    Args:
-        points: vertices of the arch, shape (v, 3).
-        towards: centre of the opposing arch, shape (3,), in the same coordinate frame with the teeth in occlusion. If
-            it is None, the crowns are on the rougher side of the surface.
+    `towards` is the centre (3,) of the opposing arch in the same frame, teeth in occlusion. If it is None, the crowns
+    are on the rougher side of the surface.
     """
     middle = points.mean(axis=0)
     _, size, axes = np.linalg.svd(points - middle, full_matrices=False)
@@ -94,11 +92,7 @@ def tops(points: Array, up: Array) -> Tops:
 
 
 def topped_by(points: Array, up: Array, piece: Indices) -> Mask:
-    """Return which components have no other component above their centre, shape (P,).
-
-    Args:
-        piece: component index of each point, shape (v,).
-    """
+    """Return which components have no other component above their centre, (P,); `piece` is that of each point, (v,)."""
     cells, height, heights = _height_map(points, up)
     count = int(piece.max()) + 1
     size = np.maximum(np.bincount(piece, minlength=count), 1)
@@ -185,14 +179,9 @@ class Labelling:
 
 
 def label_scan(mesh: Mesh, towards: Array | None) -> Labelling:
-    """Separate crown and gum of a teeth scan by its shape and, where crown and gum differ in colour, by colour.
+    """Separate crown and gum of a teeth scan [mm]; one that contains only crowns is labelled entirely as crown.
 
-    A scan that contains only crowns is labelled entirely as crown.
-
-    Args:
-        mesh: the scan [mm].
-        towards: centre of the opposing arch in the coordinate frame of the scan, teeth in occlusion, shape (3,), or
-            None.
+    `towards` is the centre (3,) of the opposing arch in the coordinate frame of the scan, teeth in occlusion, or None.
     """
     surface = ScanSurface.of(mesh)
     if len(surface.faces) < _FEWEST_FACES:
@@ -290,12 +279,9 @@ def _scraps_joined(surface: ScanSurface, crown: Mask) -> Mask:
 
 
 def crown_by_colour(colors: NDArray[np.uint8], surface: ScanSurface, seen: Tops) -> Array | None:
-    """Return the probability that each vertex is crown, judged by its colour, 0 to 1, shape (v,).
+    """Return the probability (v,) that each vertex is crown, judged by its colour; None if colours tell nothing.
 
-    Return None if the colours are not informative.
-
-    Args:
-        colors: red, green and blue of each vertex of the scan, shape (V, 3).
+    `colors` (V, 3) are the red, green and blue of each vertex of the scan.
     """
     count = len(surface.vertices)
     total = np.maximum(colors.sum(axis=1, dtype=np.float64), 1.0)

@@ -85,10 +85,7 @@ class ScanSurface:
         return float(np.median(np.linalg.norm(self.vertices[edges[:, 0]] - self.vertices[edges[:, 1]], axis=1)))
 
     def wound(self, up: Array) -> ScanSurface:
-        """Return the surface with inward-facing components flipped; `up` (3,) is the occlusal direction.
-
-        A component faces outward if its part that is visible from the occlusal side faces that side.
-        """
+        """Return the surface with components turned outward, judged by their part seen from the occlusal side `up` (3,)."""
         corners = self.vertices[self.faces]
         cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         owner = self.piece[self.faces[:, 0]]
@@ -121,8 +118,7 @@ class ScanSurface:
 
         This is the negated smaller principal curvature where that is negative, from Taubin's tensor of the normal
         curvatures along the edges ("Estimating the tensor of curvature of a surface from a polyhedral approximation",
-        ICCV 1995), computed with averaged normals. Where edges are too long for this, fold angles between faces are
-        used.
+        ICCV 1995), with averaged normals. Where edges are too long for this, fold angles between faces are used.
         """
         n = len(self.vertices)
         normals = self.normals()
@@ -212,8 +208,7 @@ class CreaseWalk:
         Args:
             up, down: which vertices are crown seeds and gum seeds, shape (v,).
             most_leaving: maximum rate at which walks leave a part of `up` for the gum, per mm of its outline [1/mm],
-                shape (v,). Parts with a higher rate have no crease around them: they are gum ridges and are discarded
-                as seeds.
+                shape (v,). Parts with a higher rate have no crease around them: they are gum ridges, no seeds.
         """
         share = self._meeting(up, down)
         leaking = self._leaking(share, up, most_leaving)

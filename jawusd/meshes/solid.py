@@ -82,10 +82,8 @@ def distance_grid(corners: Array, outer: Mask, box: Array, step_mm: float, up: f
 
     Args:
         corners: all triangles [mm], shape (F, 3, 3), y vertical, counter-clockwise seen from outside.
-        outer: faces that bound the solid (see `outer_faces`), shape (F,).
+        outer, up: see `outer_faces`.
         box: extent of the grid, its low and high corner [mm], shape (2, 3).
-        step_mm: grid step.
-        up: see `outer_faces`.
         far_mm: distance outside the solid above which values need not be exact, only at least this large.
     """
     nx, ny, nz = (int(n) for n in np.ceil((box[1] - box[0]) / step_mm) + 1)
@@ -101,10 +99,7 @@ def distance_grid(corners: Array, outer: Mask, box: Array, step_mm: float, up: f
 
 
 def _spread(numbers: NDArray[np.int32]) -> tuple[NDArray[np.int32], Array]:
-    """Return the numbers of the nearest cells whose number is not negative, and the distances to these cells [cells].
-
-    Without such cells, all numbers stay negative, and the distances are larger than any in the grid.
-    """
+    """Return the nearest number that is not negative, and its distance [cells]; -1 and a large distance if none."""
     empty = numbers < 0
     if empty.all():
         return numbers, np.full(numbers.shape, float(sum(numbers.shape)))

@@ -23,8 +23,7 @@ def grid_faces(rows: int, columns: int, closed: bool) -> Faces:
 def loft(rings: Array) -> tuple[Array, Faces]:
     """Connect stacked rings (R, A, 3) [mm] to a watertight mesh with fans at both ends.
 
-    Returns:
-        Vertices (R A + 2, 3) and faces (F, 3) with outward winding.
+    Return vertices (R A + 2, 3) and faces (F, 3) with outward winding.
     """
     n_rings, around, _ = rings.shape
     vertices = np.concatenate([rings.reshape(-1, 3), rings[[0, -1]].mean(1)])

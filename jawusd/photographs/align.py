@@ -155,10 +155,7 @@ def _result(
 
 
 def _line_distances(photo: Photo, joint: Bite, rows: ArchPair) -> tuple[Array, Array]:
-    """Return the distances of all drawn points from the outlines (N,), and of those not on the gum line (M,).
-
-    The unit is pixels at an image width of 1440 px.
-    """
+    """Return the distances of all drawn points from outlines, and of those off the gum line [px at 1440 px width]."""
     to_usual = _AT_WIDTH_PX / photo.drawing.size_px[0]
     found = match(seen_outlines(rows.fine, photo, joint), photo.drawing, _TURN_PX / to_usual)
     distance = to_usual * np.linalg.norm(found.outlines.pixels - photo.drawing.pixels, axis=1)

@@ -142,14 +142,9 @@ class Outlines:
 
 
 def split_teeth(scan: Scan, T_anatomical_scan: Array, arch: int) -> Crowns:
-    """Return the crowns of a scan as connected pieces, with a substitute gum surface if the scan has no gum.
+    """Return the crowns of a scan as connected pieces, given T_anatomical_scan (4, 4); `arch` is 0 upper, 1 lower.
 
-    In renderings, this surface lies in front of teeth on the far side of the arch, as gum does in photographs.
-
-    Args:
-        scan: one arch.
-        T_anatomical_scan: scan to (left, up, front) axes, shape (4, 4).
-        arch: 0 upper, 1 lower.
+    Without gum in the scan, a strip of faces hides teeth on the far side of the arch, as gum does in photographs.
     """
     faces = scan.crown_faces
     pairs = (faces.ravel(), np.roll(faces, 1, axis=1).ravel())
@@ -192,9 +187,7 @@ def draw_teeth(
 ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
     """Return the inverse depth [1/mm] and the number of the visible tooth (0: none) at each pixel, shape (h, w) each.
 
-    Args:
-        crowns, matrices: upper and lower crowns, with the projections from scan [mm] to homogeneous px, shape (3, 4).
-        shape: height and width of the image [px].
+    `matrices` (3, 4) project the upper and the lower scan [mm] to homogeneous px; `shape` is the height and width [px].
     """
     depth, labels = np.zeros(shape, np.float32), np.zeros(shape, np.uint8)
     number = 0

@@ -70,8 +70,8 @@ class TypicalBite:
 def typical_bites(scans: Sequence[Scan]) -> list[TypicalBite]:
     """Return typical bites, one for each possible orientation of the two arches.
 
-    The plane and forward direction of an arch follow from its shape, and its vertical direction from its gum. Without
-    gum, both vertical directions are returned.
+    The plane and forward direction of an arch follow from its shape, and up from its gum; without gum, both signs are
+    tried.
     """
     frames = [[_row_frame(scan, r, side) for side in _sides(scan, r)] for r, scan in enumerate(scans)]
     shift = make_transform(np.eye(3), np.array([0.0, _OVERBITE_MM, -_OVERJET_MM]))
@@ -109,9 +109,7 @@ def searched(
     """Return the most promising views of both arches, at most one per viewing direction, best first.
 
     Args:
-        drawing: the lines of the photograph.
         crowns: upper and lower, decimated for fast rendering.
-        usual: typical bite, which defines the anatomical axes.
         T_upper_lower: the assumed bite, shape (4, 4).
         count: number of mirrored candidates to return, and number of unmirrored candidates.
     """

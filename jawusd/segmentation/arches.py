@@ -188,9 +188,7 @@ def cut_arches(
 ) -> NDArray[np.float32]:
     """Segment an image (h, w, 3); return the coverage of both arches, 0 .. 1, shape (2, h, w).
 
-    Args:
-        reach_mm: maximum distance of tooth pixels from the projected crowns.
-        seeds: annotations, which act as hard constraints.
+    Tooth pixels lie within `reach_mm` of the projected crowns; `seeds` are hard constraints.
     """
     inside = expected.inside_px / px_per_mm
     demanded = model.surroundings_quantile(config.surroundings_share) + config.doubt
@@ -222,9 +220,8 @@ def separate_arches(
 ) -> NDArray[np.float32]:
     """Return the coverage of both arches, shape (2, h, w), after re-estimating the border between them from edges.
 
-    The sum of both coverages is unchanged. Edges between upper and lower teeth are much weaker than those between
-    teeth and lips. With a common edge weight, these weak edges would have no effect; the border would stay at its
-    predicted position and bias the poses towards the prediction.
+    The sum of both coverages is unchanged. Edges between upper and lower teeth are too weak for the common edge weight,
+    with which the border would stay at its predicted position.
     """
     inside = expected.inside_px / px_per_mm
     teeth = shares.sum(0)

@@ -20,11 +20,9 @@ def refine_borders(
 ) -> tuple[NDArray[np.float32], Mask]:
     """Return coverages (2, h, w) with soft borders, 0.5 at the outline, and a mask of visible borders, shape (h, w).
 
-    Pixels along the border are reclassified by the local colours on both sides. The colours learned over the take
-    determine which parts are teeth, but not their exact borders, since the midpoint between tooth colour and
-    surrounding colour varies locally. Fisher's discriminant between the local means determines the border (local region
-    statistics, Lankton & Tannenbaum 2008). Where the two colours are too similar, the border is invisible and is
-    not moved; parts with hardly any visible border are discarded.
+    Pixels along the border are reclassified by Fisher's discriminant between the local mean colours on both sides
+    (local region statistics, Lankton & Tannenbaum 2008), since the midpoint between tooth and surrounding colour varies
+    locally. Invisible borders are not moved; parts with hardly any visible border are discarded.
     """
     colours = _blurred(log_chroma(rgb), config.border_blur_px)
     band, window = config.border_band_mm * px_per_mm, 2 * round(config.border_side_mm * px_per_mm) + 1

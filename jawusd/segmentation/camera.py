@@ -58,11 +58,7 @@ class Segment:
 
 
 class CameraSegmenter:
-    """Segmentation of both arches in one camera's images.
-
-    Attributes:
-        colours: the colour model learned so far.
-    """
+    """Segmentation of both arches in one camera's images; `colours` is the colour model learned so far."""
 
     def __init__(self, source: Camera, meshes: Sequence[Mesh], poses: Array, config: SegmentationConfig) -> None:
         """Prepare the upper and lower scan; `poses` (2, 4, 4) are their world poses at any time of the take."""

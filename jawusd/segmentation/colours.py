@@ -98,14 +98,12 @@ class SegmentationConfig:
 class ColourModel:
     """Colour model of teeth and their surroundings: log-odds that a colour is tooth.
 
-    Pixels under projected crowns are teeth or, where lips, cheeks or tongue hide them, surroundings; all other pixels
-    are surroundings. A logistic regression on the colours, their squares and products separates the two classes. Pixels
-    under crowns that the regression classifies as surroundings are relabelled, and the regression is repeated. With so
-    few terms, it cannot overfit lip colours that occur only under crowns.
+    A logistic regression on the colours, their squares and products separates pixels under projected crowns from all
+    others. Pixels under crowns that it classifies as surroundings (lips, cheeks, tongue) are relabelled, and the
+    regression is repeated. With so few terms, it cannot overfit lip colours that occur only under crowns.
 
-    Colours are represented by lightness and the logs of red and blue over green. Shading scales all channels equally,
-    so the ratios are invariant to shading (Finlayson et al. 2006): shaded back teeth have the same ratios as lit front
-    teeth.
+    Colours are lightness and the logs of red and blue over green. The ratios are invariant to shading (Finlayson et al.
+    2006): shaded back teeth have the same ratios as lit front teeth.
     """
 
     def __init__(self, memory: float) -> None:
@@ -243,10 +241,7 @@ class ColourStates:
         write_npz_atomic(self._folder / _FILES[frame % 2], arrays, packed=False)
 
     def restore(self, done: int, step: int) -> int | None:
-        """Restore the latest colours saved up to frame `done`; step is 1 (forwards) or -1 (backwards).
-
-        Return the frame after which the colours were saved; None if there are no saved colours.
-        """
+        """Restore the colours saved last up to frame `done`; return their frame or None; step is 1 or -1 (backwards)."""
         for frame in (done, done - step):
             path = self._folder / _FILES[frame % 2]
             kept = _stored(path)

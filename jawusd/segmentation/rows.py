@@ -40,8 +40,8 @@ class Rows:
 
     Attributes:
         masks: upper and lower arch, 0 or 255, shape (2, H, W).
-        bridged: fraction of the line between the arches that crosses teeth instead of a gap, 0 .. 1; 0 if the arches do
-            not touch.
+        bridged: fraction of the line between the arches that crosses teeth instead of a gap, 0 .. 1; 0 if they do not
+            touch.
     """
 
     masks: NDArray[np.uint8]
@@ -51,8 +51,7 @@ class Rows:
 def tooth_rows(rgb: NDArray[np.uint8], turns: int = 0) -> Rows | None:
     """Return the dental arches in an RGB image (H, W, 3) of a roughly upright head; None if no teeth are found.
 
-    `turns` is the number of counter-clockwise quarter turns that make the image upright. The masks have the orientation
-    of the given image.
+    `turns` is the number of counter-clockwise quarter turns that make the image upright.
     """
     found = _upright_rows(np.ascontiguousarray(np.rot90(rgb, turns)))
     return found and Rows(np.ascontiguousarray(np.rot90(found.masks, -turns, axes=(1, 2))), found.bridged)

@@ -80,8 +80,8 @@ class PersonAnatomy:
 def build_anatomy(person: Person) -> PersonAnatomy:
     """Build the teeth and bones of a subject.
 
-    The subject's overbite and overjet determine the lower front teeth; the lower back teeth are raised until they touch
-    the upper ones.
+    Overbite and overjet determine the lower front teeth; the lower back teeth are raised until they touch the upper
+    ones.
     """
     rng = np.random.default_rng([person.seed, 0xA1A7])
     quadratic, quartic = rng.uniform(0.0160, 0.0180), rng.uniform(2.7e-5, 3.1e-5)

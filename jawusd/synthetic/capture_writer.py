@@ -87,7 +87,7 @@ class DemoConfig:
 def write_demo(folder: str | os.PathLike[str], config: DemoConfig, progress: Progress | None = None) -> Path:
     """Record a synthetic subject to a capture folder, overwriting existing files; return the path of capture.toml.
 
-    Progress is reported as the number of images done and the total number.
+    Progress is the number of images done and the total number.
 
     Raises:
         MissingDependencyError: there is no headless OpenGL (EGL).

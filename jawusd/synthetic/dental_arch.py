@@ -139,9 +139,8 @@ def _placed(
 def crown_colors(local: Array, form: CrownForm, k: int) -> NDArray[np.uint8]:
     """Return vertex colours (V, 3): red, and green on the facial side of the tips of the six front teeth.
 
-    Args:
-        local: vertices in the crown frame, shape (V, 3).
-        k: index of the tooth, from 0 (first incisor) to 6 (second molar).
+    `local` (V, 3) are vertices in the crown frame, k is the index of the tooth from 0 (first incisor) to 6 (second
+    molar).
     """
     colors = np.tile(np.array(RED, dtype=np.uint8), (len(local), 1))
     if k < 3:
@@ -159,12 +158,9 @@ def _gum(forms: tuple[CrownForm, ...], shape: ArchShape, line: ArchLine, crowns:
 
 
 def gum_ridge(line: ArchLine, s: Array, margin: Array, crowns: Array) -> tuple[Array, Faces]:
-    """Return a closed gum ridge around crowns.
+    """Return a closed gum ridge around crowns with vertices (V, 3).
 
-    Args:
-        s: arc lengths of the cross-sections, evenly spaced, shape (S,).
-        margin: height of the gum margin at each cross-section [mm], shape (S,).
-        crowns: vertices of the crowns, shape (V, 3).
+    The cross-sections have evenly spaced arc lengths s (S,), and gum margins at heights (S,) [mm].
     """
     crown_s, crown_n = line.coordinates(crowns[:, [0, 2]])
     facial, lingual = _crown_extent(s, margin, crown_s, crown_n, crowns[:, 1])

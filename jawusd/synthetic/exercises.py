@@ -72,13 +72,9 @@ def record(person: Person, n_frames: int, seed: int, kind: Kind = "training", no
 def schedule(
     names: tuple[str, ...], n_frames: int, rng: np.random.Generator, tempo: float = 1.0
 ) -> tuple[Array, NDArray[np.str_]]:
-    """Concatenate exercises, repeating them until all frames are filled.
+    """Concatenate exercises, repeating them until all frames are filled; `tempo` does not apply to chewing and speech.
 
-    Args:
-        tempo: speed factor of all exercises except chewing and speech.
-
-    Returns:
-        Controls with smoothed transitions, shape (F, 3), and the exercise of each frame, shape (F,).
+    Return controls with smoothed transitions, shape (F, 3), and the exercise of each frame, shape (F,).
 
     Raises:
         ValueError: there is less than one frame.
@@ -142,10 +138,7 @@ def _border(n: int, turn: float, end: int) -> tuple[Array, Array]:
     """Trace the border: the jaw moves to one side with closed teeth, opens there, crosses over, closes on the other.
 
     The mandible crosses over during the first part of closing (fraction `turn`), and returns to the middle in the last
-    `end` frames.
-
-    Returns:
-        Opening 0..1 and excursion -1..1, shape (n,) each.
+    `end` frames. Return opening 0..1 and excursion -1..1, shape (n,) each.
     """
     first, second = n // 5, int(0.4 * n)
     out, up, down = (np.arange(k) / k for k in (first, second, n - first - second))

@@ -61,14 +61,9 @@ def smoothstep(x: ArrayLike) -> Array:
 
 
 def eminence(joint: Joint, side: int, slide_mm: ArrayLike, medial_mm: ArrayLike = 0.0) -> Array:
-    """Return the height of a condyle centre relative to rest [mm], negative if it is down the eminence.
+    """Return the height of a condyle centre (side 0 left, 1 right) relative to rest [mm], negative down the eminence.
 
-    The sagittal section is `eminence_path`.
-
-    Args:
-        side: 0 left, 1 right.
-        slide_mm: forward distance of the condyle from rest, any shape.
-        medial_mm: displacement of the condyle towards the midline, same shape.
+    Slides forward (any shape) follow `eminence_path`; `medial_mm` is the displacement towards the midline, same shape.
     """
     slide = np.asarray(slide_mm, dtype=np.float64)
     return eminence_path(joint, side, slide) - joint.medial_slope[side] * np.asarray(medial_mm) * smoothstep(

@@ -110,9 +110,8 @@ class Person:
     def pose_with_extra(self, controls: ArrayLike, extra_mm: ArrayLike) -> Array:
         """Return mandible poses (..., 4, 4) that include movements outside the three controls; see `controlled_pose`.
 
-        Args:
-            controls: opening, lateral, protrusion, shape (..., 3).
-            extra_mm: side shift, lift of the left and of the right condyle, shape (..., 3).
+        `controls` (..., 3) are opening, lateral, protrusion; `extra_mm` (..., 3) side shift, lift of the left and right
+        condyle.
         """
         opening, lateral, protrusion = np.moveaxis(np.asarray(controls, dtype=np.float64), -1, 0)
         return controlled_pose(self.joint, opening, lateral, protrusion, extra_mm)

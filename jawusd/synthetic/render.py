@@ -99,15 +99,14 @@ class Renderer:
         light: float = 1.0,
         jitter_px: tuple[Array, Array] | None = None,
     ) -> Picture:
-        """Render an image.
+        """Render an image of a camera, given by its index.
 
         Args:
-            camera: index of the camera.
             T_world_part: poses of the surfaces to draw, (4, 4) each; other surfaces are hidden.
             T_world_head: pose of the skull, shape (4, 4); shading uses the depth inside the mouth in the skull frame.
             light: brightness factor.
-            jitter_px: displacement fields of the upper and the lower mask [px], shape (gh, gw, 2) each, stretched over
-                the image; None means zero.
+            jitter_px: displacement fields of the upper and the lower mask [px], (gh, gw, 2) each, stretched over the
+                image.
         """
         with self._gl:
             self._draw_scene(self._cameras[camera], T_world_part, T_world_head, light)

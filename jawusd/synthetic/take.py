@@ -232,8 +232,7 @@ class Scene:
     def pose(self, take: Take, index: int, slide_mm: Array | float = 0.0) -> dict[str, Array]:
         """Deform face and tongue for a frame of a take; return the poses T_world_part (4, 4) of all surfaces.
 
-        Args:
-            slide_mm: displacements added to the vertices of the face, skull frame [mm], shape (V, 3) or ().
+        `slide_mm`, (V, 3) or (), is added to the vertices of the face, skull frame [mm].
         """
         T_jaw, head = take.T_skull_mandible[index], take.T_world_skull[index]
         self._renderer.move("face", self._face.posed(take.lips[index], T_jaw) + slide_mm)

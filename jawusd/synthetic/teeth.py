@@ -95,8 +95,7 @@ def _relative_width(control: tuple[float, ...], t: Array) -> Array:
 def crown(form: CrownForm, cusp_slope: float, rng: np.random.Generator) -> tuple[Array, NDArray[np.int32]]:
     """Build one crown with small random irregularities; `cusp_slope` [-] is the slope of the cusps of back teeth.
 
-    Returns:
-        Vertices (V, 3) in the crown frame [mm] and outward counter-clockwise faces (F, 3) of a closed mesh.
+    Return vertices (V, 3) in the crown frame [mm] and outward counter-clockwise faces (F, 3) of a closed mesh.
     """
     angle = 2 * np.pi * (np.arange(_AROUND) + 0.5) / _AROUND
     rings = _back_rings(form, angle, cusp_slope) if form.cusps else _front_rings(form, angle, rng)
