@@ -90,7 +90,7 @@ class TextTable:
     places: list[str]
 
     def numbers(self, columns: Sequence[int], rows: Sequence[int] | None = None) -> Array:
-        """Return columns and rows (default: all), given by index, as numbers, (rows, columns); `nan` and `inf` are kept.
+        """Return columns and rows (default: all), given by index, as numbers, (rows, columns), with `nan` and `inf`.
 
         Raises:
             FormatError: a cell is not a number, or the decimal separator is ambiguous.

@@ -85,7 +85,7 @@ class ScanSurface:
         return float(np.median(np.linalg.norm(self.vertices[edges[:, 0]] - self.vertices[edges[:, 1]], axis=1)))
 
     def wound(self, up: Array) -> ScanSurface:
-        """Return the surface with components turned outward, judged by their part seen from the occlusal side `up` (3,)."""
+        """Return the surface with components turned outward, judged by their part seen from the side `up` (3,)."""
         corners = self.vertices[self.faces]
         cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         owner = self.piece[self.faces[:, 0]]

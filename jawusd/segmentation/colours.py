@@ -241,7 +241,7 @@ class ColourStates:
         write_npz_atomic(self._folder / _FILES[frame % 2], arrays, packed=False)
 
     def restore(self, done: int, step: int) -> int | None:
-        """Restore the colours saved last up to frame `done`; return their frame or None; step is 1 or -1 (backwards)."""
+        """Restore the colours saved last up to frame `done`; return their frame or None; step: 1 or -1 (backwards)."""
         for frame in (done, done - step):
             path = self._folder / _FILES[frame % 2]
             kept = _stored(path)
