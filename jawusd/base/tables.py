@@ -75,19 +75,12 @@ def _not_text(path: Path, error: UnicodeDecodeError, encoding: str) -> FormatErr
 
 @dataclass(frozen=True)
 class TextTable:
-    """A table with a header, cells as text.
+    """A table with a header, cells as text."""
 
-    Attributes:
-        path: the file, for messages.
-        header: column names, without blank ones at the end.
-        rows: cells, one per column.
-        places: place of each row in the file, such as "line 3".
-    """
-
-    path: Path
-    header: list[str]
-    rows: list[list[str]]
-    places: list[str]
+    path: Path  # the file, for messages
+    header: list[str]  # column names, without blank ones at the end
+    rows: list[list[str]]  # cells, one per column
+    places: list[str]  # place of each row in the file, such as "line 3"
 
     def numbers(self, columns: Sequence[int], rows: Sequence[int] | None = None) -> Array:
         """Return columns and rows (default: all), given by index, as numbers, (rows, columns), with `nan` and `inf`.

@@ -28,18 +28,13 @@ _PARTS = 16  # number of chunks into which poses are split for threads
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    """Points of a surface, sorted into a tree of boxes so that all points of a distant box are skipped at once.
+    """Points of a surface, sorted into a tree of boxes so that all points of a distant box are skipped at once."""
 
-    Attributes:
-        points: the points, in the order of the smallest boxes [mm], shape (P, 3).
-        balls: bounding sphere of the points of each box, centre and radius [mm], shape (B, 4). Boxes are in depth-first
-            order.
-        nodes: for each box, the range of its points (first, one past the last; 0, 0 for boxes with children), and the
-            index of the next box that is not inside the box, shape (B, 3).
-    """
-
-    points: Array
+    points: Array  # the points, in the order of the smallest boxes [mm], shape (P, 3)
+    # bounding sphere of the points of each box, centre and radius [mm], shape (B, 4). Boxes are in depth-first order
     balls: Array
+    # for each box, the range of its points (first, one past the last; 0, 0 for boxes with children), and the index of
+    # the next box that is not inside the box, shape (B, 3)
     nodes: NDArray[np.int64]
 
 

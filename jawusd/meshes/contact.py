@@ -56,18 +56,12 @@ class Surfaces(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Teeth:
-    """Both dental arches in the anatomical frame, the lower one in the closed bite.
-
-    Attributes:
-        closed_mm: Penetration depth in the closed bite; negative for a gap.
-        T_anatomical_skull: Skull to anatomical coordinates, shape (4, 4).
-        T_rest: T_skull_mandible of the closed bite, shape (4, 4).
-    """
+    """Both dental arches in the anatomical frame, the lower one in the closed bite."""
 
     pair: Pair
-    closed_mm: float
-    T_anatomical_skull: Array
-    T_rest: Array
+    closed_mm: float  # penetration depth in the closed bite; negative for a gap
+    T_anatomical_skull: Array  # skull to anatomical coordinates, shape (4, 4)
+    T_rest: Array  # T_skull_mandible of the closed bite, shape (4, 4)
 
     def clearances(self, T_skull_mandible: Array) -> Array:
         """Return the clearance [mm], shape (n,), in poses (n, 4, 4): closed-bite depth minus depth in the pose."""
@@ -190,19 +184,12 @@ def _error(surfaces: Surfaces, rig: JawRig, field: ContactField) -> float:
 
 @dataclass(frozen=True, eq=False)
 class _Arch:
-    """The occlusal side of an arch as a height map.
+    """The occlusal side of an arch as a height map."""
 
-    Attributes:
-        points: Surface points in the coordinate frame of the solid [mm], shape (n, 3).
-        pixels: Row and column of each point in the image, shape (n, 2).
-        shade: Brightness of each point, shape (n,).
-        size: Number of rows and columns of the image.
-    """
-
-    points: Array
-    pixels: NDArray[np.int64]
-    shade: Array
-    size: tuple[int, int]
+    points: Array  # surface points in the coordinate frame of the solid [mm], shape (n, 3)
+    pixels: NDArray[np.int64]  # row and column of each point in the image, shape (n, 2)
+    shade: Array  # brightness of each point, shape (n,)
+    size: tuple[int, int]  # number of rows and columns of the image
 
 
 class ContactMap:

@@ -34,20 +34,14 @@ _DEEPEST_MM, _WIDEST_MM = 2.5, 8.0
 
 @dataclass(frozen=True, eq=False)
 class Joints:
-    """Both jaw joints in the anatomical frame, the mandible in the closed bite.
+    """Both jaw joints in the anatomical frame, the mandible in the closed bite."""
 
-    Attributes:
-        pairs: Skull and condyle as solids, for the left and the right joint.
-        closed: Penetration depth of each condyle into the skull in the closed bite [mm], shape (2,); negative for gaps,
-            down to -`collision.FARTHEST_MM`.
-        T_anatomical_skull: Skull to anatomical coordinates, shape (4, 4).
-        T_rest: T_skull_mandible of the closed bite, shape (4, 4).
-    """
-
-    pairs: tuple[Pair, Pair]
+    pairs: tuple[Pair, Pair]  # skull and condyle as solids, for the left and the right joint
+    # penetration depth of each condyle into the skull in the closed bite [mm], shape (2,); negative for gaps, down to
+    # -`collision.FARTHEST_MM`
     closed: Array
-    T_anatomical_skull: Array
-    T_rest: Array
+    T_anatomical_skull: Array  # skull to anatomical coordinates, shape (4, 4)
+    T_rest: Array  # T_skull_mandible of the closed bite, shape (4, 4)
 
     @property
     def closed_mm(self) -> float:

@@ -30,17 +30,11 @@ _MOST_CROSSINGS = 256
 
 @dataclass(frozen=True, eq=False)
 class DistanceGrid:
-    """Signed distances at the points of a regular grid.
+    """Signed distances at the points of a regular grid."""
 
-    Attributes:
-        origin: position of the first grid point [mm], shape (3,).
-        step_mm: grid step along every axis.
-        values: signed distances [mm], negative inside, shape (nx, ny, nz), float32.
-    """
-
-    origin: Array
-    step_mm: float
-    values: NDArray[np.float32]
+    origin: Array  # position of the first grid point [mm], shape (3,)
+    step_mm: float  # grid step along every axis
+    values: NDArray[np.float32]  # signed distances [mm], negative inside, shape (nx, ny, nz), float32
 
 
 class _Columns(NamedTuple):

@@ -25,19 +25,12 @@ _FEWEST_POINTS = 300
 
 @dataclass(frozen=True, eq=False)
 class Drawing:
-    """The lines drawn in one photograph.
+    """The lines drawn in one photograph."""
 
-    Attributes:
-        name: name of the photograph, for messages.
-        pixels: points on the lines [px], about one pixel apart, shape (N, 2).
-        normals: unit vectors across the lines, of arbitrary sign, shape (N, 2).
-        size_px: width and height of the image.
-    """
-
-    name: str
-    pixels: Array
-    normals: Array
-    size_px: tuple[int, int]
+    name: str  # name of the photograph, for messages
+    pixels: Array  # points on the lines [px], about one pixel apart, shape (N, 2)
+    normals: Array  # unit vectors across the lines, of arbitrary sign, shape (N, 2)
+    size_px: tuple[int, int]  # width and height of the image
 
     def mirrored(self) -> Drawing:
         """Return the drawing with left and right exchanged."""
@@ -117,24 +110,15 @@ class Crowns:
 
 @dataclass(frozen=True, eq=False)
 class Outlines:
-    """Points on the visible outlines of all teeth in one image.
+    """Points on the visible outlines of all teeth in one image."""
 
-    Attributes:
-        points: points on the crowns, scan coordinates of their own arch [mm], shape (N, 3).
-        arch: 0 upper, 1 lower, shape (N,).
-        tooth: tooth number from 1, continuing from the upper to the lower arch, shape (N,); connected teeth share a
-            number.
-        pixels: image positions [px], shape (N, 2).
-        normals: unit normals pointing out of the tooth in the image, shape (N, 2).
-        gum: 1 where the outline faces the gum of its arch, decreasing to 0 at a right angle [-], shape (N,).
-    """
-
-    points: Array
-    arch: NDArray[np.int64]
+    points: Array  # points on the crowns, scan coordinates of their own arch [mm], shape (N, 3)
+    arch: NDArray[np.int64]  # 0 upper, 1 lower, shape (N,)
+    # tooth number from 1, continuing from the upper to the lower arch, shape (N,); connected teeth share a number
     tooth: NDArray[np.int64]
-    pixels: Array
-    normals: Array
-    gum: Array
+    pixels: Array  # image positions [px], shape (N, 2)
+    normals: Array  # unit normals pointing out of the tooth in the image, shape (N, 2)
+    gum: Array  # 1 where the outline faces the gum of its arch, decreasing to 0 at a right angle [-], shape (N,)
 
     def take(self, index: NDArray[np.int64]) -> Outlines:
         """Return the points at given indices, which may repeat."""

@@ -176,17 +176,11 @@ class Bite:
 
 @dataclass(frozen=True, eq=False)
 class Match:
-    """Drawn points with their matched outline points.
+    """Drawn points with their matched outline points."""
 
-    Attributes:
-        outlines: the matched outline point of each drawn point.
-        off_px: signed distance of the outline from the drawn point along the outline's normal, shape (N,).
-        apart: distance in position and direction (see `features`) [px], shape (N,).
-    """
-
-    outlines: Outlines
-    off_px: Array
-    apart: Array
+    outlines: Outlines  # the matched outline point of each drawn point
+    off_px: Array  # signed distance of the outline from the drawn point along the outline's normal, shape (N,)
+    apart: Array  # distance in position and direction (see `features`) [px], shape (N,)
 
 
 def match(seen: Outlines, drawing: Drawing, turn_px: float) -> Match:

@@ -36,15 +36,10 @@ _LINE_PX = (-1, 0, 1)  # offsets from a line of the pixel rows that are averaged
 
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """Both dental arches in an image.
+    """Both dental arches in an image."""
 
-    Attributes:
-        masks: upper and lower arch, 0 or 255, shape (2, H, W).
-        bridged: fraction of the line between the arches that crosses teeth instead of a gap, 0 .. 1; 0 if they do not
-            touch.
-    """
-
-    masks: NDArray[np.uint8]
+    masks: NDArray[np.uint8]  # upper and lower arch, 0 or 255, shape (2, H, W)
+    # fraction of the line between the arches that crosses teeth instead of a gap, 0 .. 1; 0 if they do not touch
     bridged: float
 
 

@@ -30,14 +30,10 @@ _BACKDROP = (0.035, 0.050, 0.066)
 
 @dataclass(frozen=True, eq=False)
 class Picture:
-    """One rendered image.
+    """One rendered image."""
 
-    Attributes:
-        color: colour image, sRGB-like, shape (h, w, 3).
-        upper, lower: coverage of each pixel by visible upper and lower teeth, 0..255, shape (h, w).
-    """
-
-    color: NDArray[np.uint8]
+    color: NDArray[np.uint8]  # colour image, sRGB-like, shape (h, w, 3)
+    # coverage of each pixel by visible upper and lower teeth, 0..255, shape (h, w)
     upper: NDArray[np.uint8]
     lower: NDArray[np.uint8]
 
