@@ -97,13 +97,10 @@ class SkinTracker:
         found = np.full((len(self._views), len(points), 2), np.nan)
         found[a] = points
         for b in range(a + 1, len(self._views)):
-            if self._angle(a, b) <= _MOST_ANGLE:
+            axes = [self._views[c].camera.T_cam_world[2, :3] for c in (a, b)]
+            if np.arccos(np.clip(axes[0] @ axes[1], -1, 1)) <= _MOST_ANGLE:
                 found[b] = self._across(a, b, points, T_world_mouth)
         return found
-
-    def _angle(self, a: int, b: int) -> float:
-        axes = [self._views[c].camera.T_cam_world[2, :3] for c in (a, b)]
-        return float(np.arccos(np.clip(axes[0] @ axes[1], -1, 1)))
 
     def _across(self, a: int, b: int, points: Array, T_world_mouth: Array) -> Array:
         """Return where points (n, 2) of camera `a` are in camera `b` [px], by planes near the skin; NaN if nowhere."""

@@ -134,11 +134,14 @@ def descend(model: Array, problem: Problem, x: Array, w: Scratch, n: Normal) -> 
         return
     damping = START_DAMPING
     for _ in range(ITERATIONS):
-        _damp(n.A, damping, n.damped)
+        n.damped[:] = n.A
+        for i in range(3):
+            n.damped[i, i] += damping * ((n.A[0, 0] + n.A[1, 1] + n.A[2, 2]) / 3.0) + MIN_STIFFNESS
         solve(n.damped, n.g, n.step)
         for i in range(3):
             n.trial[i] = x[i] - n.step[i]
-        if _settled(n.step) or damping >= MAX_DAMPING:
+        settled = max(abs(n.step[0]), abs(n.step[1]), abs(n.step[2])) <= TOLERANCE_MM
+        if settled or damping >= MAX_DAMPING:
             x[:] = n.trial  # the last step doubles the number of correct digits, so it needs no further evaluation
             return
         trial_cost = equations(model, problem, n.trial, w, n.A_trial, n.g_trial)
@@ -148,19 +151,6 @@ def descend(model: Array, problem: Problem, x: Array, w: Scratch, n: Normal) -> 
             damping = max(damping * 0.1, MIN_DAMPING)
         else:
             damping *= 10.0
-
-
-@device
-def _settled(step: Array) -> bool:
-    return max(abs(step[0]), abs(step[1]), abs(step[2])) <= TOLERANCE_MM
-
-
-@device
-def _damp(A: Array, damping: float, out: Array) -> None:
-    amount = damping * ((A[0, 0] + A[1, 1] + A[2, 2]) / 3.0) + MIN_STIFFNESS
-    out[:] = A
-    for i in range(3):
-        out[i, i] += amount
 
 
 class Encoding(NamedTuple):

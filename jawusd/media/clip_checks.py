@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
+from functools import partial
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -51,35 +52,27 @@ def decoded_findings(video: Clip, camera: str) -> Iterator[Finding]:
 
     The kinds of findings are "clip_damaged", "interlaced" and "pictures_repeated".
     """
+    finding = partial(Finding, path=str(video.path), camera=camera)
     repeated: list[tuple[int, int]] = []
     for first, last in _parts(video):
         try:
             changes = picture_changes(frame.image for frame in video.frames(first, last))
         except JawusdError as error:
-            yield Finding(
-                "clip_damaged",
-                "error",
-                error.message,
-                path=str(video.path),
-                camera=camera,
-                hint=error.hint,
-            )
+            yield finding("clip_damaged", "error", error.message, hint=error.hint)
             break
         repeated += [(first + start, first + end) for start, end in repeated_runs(changes)]
     if video.is_interlaced:
-        yield Finding("interlaced", "warning", INTERLACED, path=str(video.path), camera=camera, hint=INTERLACED_HINT)
+        yield finding("interlaced", "warning", INTERLACED, hint=INTERLACED_HINT)
     if repeated:
         numbers = [video.timeline.numbers[[start, end]].tolist() for start, end in repeated]
         listed = ", ".join(f"{start} to {end}" if end > start else f"{start}" for start, end in numbers[:_LISTED])
         more = f" and {len(numbers) - _LISTED} more times" if len(numbers) > _LISTED else ""
-        yield Finding(
+        yield finding(
             "pictures_repeated",
             "warning",
             f"frames {listed}{more} repeat the previous image: the camera froze, or images were duplicated",
             sum(end - start + 1 for start, end in repeated),
             0,
-            path=str(video.path),
-            camera=camera,
             frame=numbers[0][0],
             hint="Export the clip again at its own frame rate, or exclude those frames from the take.",
         )
@@ -154,38 +147,23 @@ def _stands_out(changes: Array, first: int, last: int) -> bool:
 def rate_findings(videos: Mapping[str, Clip], fps: float, path: str) -> Iterator[Finding]:
     """Compare the frame rates of clips by camera with the rate [Hz] in the capture at `path`, and with one another."""
     for name, video in videos.items():
-        rate = video.timeline.rate
+        rate, missing, count = video.timeline.rate, video.timeline.missing, video.timeline.count
         if abs(rate / fps - 1.0) > _RATE_TOLERANCE:
-            yield Finding(
-                "fps_differs",
-                "warning",
-                f"fps is {fps:g} in the capture, but the clip has {rate:.3f} frames per second",
-                rate,
-                fps,
-                path=path,
-                camera=name,
-                hint="Correct fps or convert the clip, otherwise speeds and times are wrong.",
-            )
-        if isinstance(video, PictureSequence) and video.timeline.missing:
-            yield Finding(
-                "pictures_missing",
-                "warning",
-                f"images {gaps(video.numbers.tolist())} are missing",
-                video.timeline.missing / video.timeline.count,
-                path=str(video.path),
-                camera=name,
+            said = f"fps is {fps:g} in the capture, but the clip has {rate:.3f} frames per second"
+            hint = "Correct fps or convert the clip, otherwise speeds and times are wrong."
+            yield Finding("fps_differs", "warning", said, rate, fps, path=path, camera=name, hint=hint)
+        absent = partial(
+            Finding, "pictures_missing", "warning", value=missing / count, path=str(video.path), camera=name
+        )
+        if isinstance(video, PictureSequence) and missing:
+            yield absent(
+                message=f"images {gaps(video.numbers.tolist())} are missing",
                 hint="Export them again, or ignore this: those frames are tracked without this camera.",
             )
-        elif (share := video.timeline.missing / video.timeline.count) > _MISSING_SHARE:
-            yield Finding(
-                "pictures_missing",
-                "warning",
-                f"{video.timeline.missing} of {video.timeline.count} frames have no image: dropped "
-                "frames or a variable rate",
-                share,
-                _MISSING_SHARE,
-                path=str(video.path),
-                camera=name,
+        elif missing / count > _MISSING_SHARE:
+            yield absent(
+                message=f"{missing} of {count} frames have no image: dropped frames or a variable rate",
+                limit=_MISSING_SHARE,
                 hint="Those frames are tracked without this camera.",
             )
     reference = next(iter(videos.values()), None)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -33,20 +34,16 @@ def survey_masks(source: CameraSource, size_px: tuple[int, int]) -> list[Finding
             masks.
     """
     if source.masks is None:
-        return [
-            Finding(
-                "camera_without_masks",
-                "warning",
-                "the camera has no masks and is not used for tracking.",
-                camera=source.name,
-                hint="Add masks in capture.toml, or create them with `jawusd segment`.",
-            )
-        ]
+        hint = "Add masks in capture.toml, or create them with `jawusd segment`."
+        said = "the camera has no masks and is not used for tracking."
+        return [Finding("camera_without_masks", "warning", said, camera=source.name, hint=hint)]
     readers = open_masks(source, size_px)
+    hint = "Export the masks with the teeth in white, or remove `masks` of this camera."
+    black = partial(Finding, "masks_black", "warning", camera=source.name, hint=hint)
     if all(reader.is_black for reader in readers):
-        return [_black(source, "its masks are all black: it is not used for tracking.")]
+        return [black(message="its masks are all black: it is not used for tracking.")]
     out = [
-        _black(source, f"the masks of the {arch} teeth are all black and are not used.")
+        black(message=f"the masks of the {arch} teeth are all black and are not used.")
         for arch, reader in zip(ARCHES, readers, strict=True)
         if reader.is_black
     ]
@@ -64,26 +61,9 @@ def odd_pictures(source: CameraSource, arch: str, odd: Sequence[str]) -> list[Fi
     if not odd:
         return []
     more = f"; and {len(odd) - _LISTED} more" if len(odd) > _LISTED else ""
-    return [
-        Finding(
-            "masks_odd",
-            "warning",
-            f"{len(odd)} masks of the {arch} teeth are not used: {'; '.join(odd[:_LISTED])}{more}.",
-            value=len(odd),
-            camera=source.name,
-            hint="Export these masks like the other masks.",
-        )
-    ]
-
-
-def _black(source: CameraSource, message: str) -> Finding:
-    return Finding(
-        "masks_black",
-        "warning",
-        message,
-        camera=source.name,
-        hint="Export the masks with the teeth in white, or remove `masks` of this camera.",
-    )
+    said = f"{len(odd)} masks of the {arch} teeth are not used: {'; '.join(odd[:_LISTED])}{more}."
+    hint = "Export these masks like the other masks."
+    return [Finding("masks_odd", "warning", said, value=len(odd), camera=source.name, hint=hint)]
 
 
 def _of_levels(source: CameraSource, rows: str, levels: MaskLevels) -> list[Finding]:
@@ -92,16 +72,8 @@ def _of_levels(source: CameraSource, rows: str, levels: MaskLevels) -> list[Find
         low, high = sorted((levels.background, levels.teeth))
         inverted = "; they are inverted, with teeth dark on light" if levels.inverted else ""
         channel = "transparency" if levels.plane == "alpha" else "masks"
-        out.append(
-            Finding(
-                "mask_levels",
-                "note",
-                f"the {channel} of {rows} teeth have the values {low:g} and {high:g}: {levels.teeth:g} is "
-                f"taken as teeth{inverted}.",
-                value=levels.teeth,
-                camera=source.name,
-            )
-        )
+        said = f"the {channel} of {rows} teeth have the values {low:g} and {high:g}: {levels.teeth:g} is taken as teeth"
+        out.append(Finding("mask_levels", "note", f"{said}{inverted}.", value=levels.teeth, camera=source.name))
     if levels.soft > MOST_SOFT:
         out.append(
             Finding(

@@ -238,7 +238,10 @@ def open_masks(
     masks = source.masks
     if masks is None:
         raise ValueError(f"camera {source.name} has no masks")
-    timeline = None if source.clip is None else _timeline(source.clip, _changed_ns(source.clip.path))
+    timeline = None
+    if source.clip is not None:
+        path = source.clip.path
+        timeline = _timeline(source.clip, (path.parent if is_pattern(path) else path).stat().st_mtime_ns)
     labels = masks.labels
     upper = MaskReader(masks.upper, size_px, timeline=timeline, labels=labels, prepare=prepare)
     lower = MaskReader(masks.lower, size_px, timeline=timeline, labels=labels and labels[::-1], prepare=prepare)
@@ -249,10 +252,6 @@ def open_masks(
 def _timeline(clip: ClipSource, changed_ns: int) -> Timeline:
     """Return the timeline of a clip; the modification time identifies the version of the file."""
     return open_clip(clip).timeline
-
-
-def _changed_ns(path: Path) -> int:
-    return (path.parent if is_pattern(path) else path).stat().st_mtime_ns
 
 
 def mask_size_px(path: str | os.PathLike[str]) -> tuple[int, int]:

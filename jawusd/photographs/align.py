@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -174,24 +175,21 @@ def _findings(photos: Sequence[AlignedPhoto]) -> tuple[Finding, ...]:
     """Return the findings about an alignment."""
     out = []
     for photo in photos:
+        finding = partial(Finding, camera=photo.name)
         if photo.misfit > _MOST_MISFIT:
             message = f"the crowns do not fit the drawn lines (misfit {photo.misfit:.2f}; at most {_MOST_MISFIT})"
             hint = "Check that the scans are recent and of this subject, and that the teeth are closed."
-            out.append(
-                Finding("photo_unfit", "error", message, photo.misfit, _MOST_MISFIT, camera=photo.name, hint=hint)
-            )
+            out.append(finding("photo_unfit", "error", message, photo.misfit, _MOST_MISFIT, hint=hint))
         elif photo.other_hand < _SAME_HAND:
             message = f"the photograph fits about equally well {'un' if photo.mirrored else ''}mirrored"
-            out.append(Finding("photo_hand", "warning", message, photo.other_hand, _SAME_HAND, camera=photo.name))
+            out.append(finding("photo_hand", "warning", message, photo.other_hand, _SAME_HAND))
         if photo.alone_off_mm > _APART_MM:
             message = (
                 f"aligned alone, it places the lower incisor {photo.alone_off_mm:.1f} mm from the joint result "
                 f"(at most {_APART_MM} mm is allowed)"
             )
             hint = "A single view is inaccurate along its line of sight; photographs of different bites also disagree."
-            out.append(
-                Finding("photo_bite", "warning", message, photo.alone_off_mm, _APART_MM, camera=photo.name, hint=hint)
-            )
+            out.append(finding("photo_bite", "warning", message, photo.alone_off_mm, _APART_MM, hint=hint))
     return tuple(out)
 
 
