@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import lru_cache, partial
+from functools import lru_cache, partial, wraps
 from pathlib import Path
+from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -16,6 +17,7 @@ from jawusd.media.pictures import has_palette, read_palette_numbers, read_pictur
 from jawusd.media.pixels import Colour
 from jawusd.media.video import Video
 
+_T = TypeVar("_T")
 _SAMPLED = 10  # number of images sampled from a take
 _FEWEST_OF_VIDEO = 4
 _NEUTRAL = 12  # maximum difference [of 255] between the channels of a gray image after lossy coding
@@ -50,30 +52,28 @@ def png_levels(files: Sequence[Path], is_other: Callable[[RawImage], bool] | Non
         others.files = []  # the cache keeps this object; free its list of up to tens of thousands of files
 
 
-def video_levels(path: Path) -> tuple[SourceLevels, Colour]:
-    """Find the levels of a mask video from samples, and the pixel format to decode.
+def _by_version(read: Callable[[Path], _T]) -> Callable[[Path], _T]:
+    """Return a cached function of a file; its modification time and size identify the version of the file."""
 
-    Raises:
-        CaptureError: the video cannot be decoded, or the images are not masks.
-    """
-    return _video_levels_of_version(path, path.stat().st_mtime_ns)
+    @lru_cache(maxsize=64)
+    def of_version(path: Path, version: tuple[int, int] | None) -> _T:
+        return read(path)
+
+    @wraps(read)
+    def current(path: Path) -> _T:
+        found = path.stat() if path.is_file() else None  # the reader reports a missing file
+        return of_version(path, found and (found.st_mtime_ns, found.st_size))
+
+    return current
 
 
+@_by_version
 def mask_video(path: Path) -> Video:
-    """Return a mask video from a cache, since a take opens the video a dozen times.
+    """Return a mask video, which a take opens a dozen times.
 
     Raises:
         CaptureError: see `Video`.
     """
-    if not path.is_file():
-        return Video(path)  # a missing file raises the error here
-    found = path.stat()
-    return _video_of_version(path, found.st_mtime_ns, found.st_size)
-
-
-@lru_cache(maxsize=64)
-def _video_of_version(path: Path, changed_ns: int, size: int) -> Video:
-    """Open a video; modification time and size identify the version of the file."""
     return Video(path)
 
 
@@ -132,9 +132,13 @@ def _png_levels_of_version(
     return SourceLevels(None, sizes_px=tuple((path, size) for size, path in sizes.items()))
 
 
-@lru_cache(maxsize=256)
-def _video_levels_of_version(path: Path, changed_ns: int) -> tuple[SourceLevels, Colour]:
-    """Find the levels of a video and the format to decode; the modification time identifies the version."""
+@_by_version
+def video_levels(path: Path) -> tuple[SourceLevels, Colour]:
+    """Find the levels of a mask video from samples, and the pixel format to decode.
+
+    Raises:
+        CaptureError: the video cannot be decoded, or the images are not masks.
+    """
     video = mask_video(path)
     colour: Colour = "gray" if video.is_gray else "rgba" if video.has_alpha else "rgb"
     # Key frames are sampled because they are fast to decode; several, because some are empty, often the first.
