@@ -1,20 +1,4 @@
-"""The exceptions of jawusd: one tree, one exit code per family.
-
-    JawusdError                     exit 1, never raised itself
-      FormatError          exit 3   a file does not follow its format
-        VersionError                written by a newer jawusd
-        UnitsError                  lengths or angles in another unit
-      MissingDependencyError exit 4 an optional package is not installed
-      CaptureError         exit 5   the capture cannot be used
-        CalibrationError
-        SyncError
-      TrackingError        exit 6
-      FittingError         exit 7
-      RigError             exit 8
-      EvaluatorError       exit 9
-      OutputError          exit 10  the output cannot be written, or would overwrite something
-      ClusterError         exit 11  the workers of a cluster cannot be used
-      ResourceError        exit 12  out of memory or processor time, or a library crashed
+"""The exceptions of jawusd, with one exit code per family.
 
 A message states the place (file, frame, camera), what was found, what is allowed with its unit, and what to do.
 """

@@ -18,7 +18,7 @@ import numpy as np
 from jawusd.base.arrays import Array
 from jawusd.base.errors import CalibrationError
 from jawusd.base.tables import read_text
-from jawusd.cameras.files import CameraFormat, Size, check_lens_model, files_in, parsed_xml, plain_name
+from jawusd.cameras.files import CameraFormat, Size, check_lens_model, files_in, known_size, parsed_xml
 from jawusd.formats.text import parse_json
 from jawusd.geometry import Camera, make_transform, rigidity_defect, so3_exp
 
@@ -177,10 +177,8 @@ def _camera(path: Path, name: str, parts: Mapping[str, Array], sizes: Mapping[st
                 f"camera {name} has image size {sides.tolist()} px; width and height must be 1 to 1e6 px.", path=path
             )
         size = (int(sides[0]), int(sides[1]))
-    elif name in sizes or plain_name(name) in sizes:
-        size = sizes[name if name in sizes else plain_name(name)]
     else:
-        raise CalibrationError(f"camera {name} has no image_width and image_height.", path=path)
+        size = known_size(path, name, sizes)
     R = so3_exp(parts["R"].ravel()) if parts["R"].size == 3 else parts["R"]
     K, T, lens = parts["K"], parts["T"].ravel(), parts.get("dist", np.zeros(0)).ravel()
     if K.shape != (3, 3) or R.shape != (3, 3) or T.shape != (3,) or lens.size not in (0, 4, 5, 8, 12, 14):

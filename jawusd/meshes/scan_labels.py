@@ -144,15 +144,13 @@ _FEWEST_FACES = 100  # minimum number of faces of a scan; scans with fewer canno
 _CROWN_MM = 4.0
 # Fraction of a component's height, from its lower end, in which vertices become gum seeds if there are no better ones.
 _LOWEST = 0.12
-# Maximum rate at which random walks from a crown top reach the gum, per mm of the top's outline [1/mm]. The limit is
-# divided by a factor that grows with the depth of the top below the hull of the dental arch. Observed rates (40 scans,
-# each one surface): 0.003 (median) to 0.030 at crowns, 0.026 to 0.074 at ridges without teeth, most of which are below
-# the hull.
+# Maximum rate at which random walks from a crown top reach the gum, per mm of the top's outline [1/mm], divided by a
+# factor that grows with the top's depth below the hull of the arch. Observed in 40 scans: up to 0.030 at crowns, 0.026
+# to 0.074 at ridges without teeth, most of which are below the hull.
 _LEAVING, _STRICTER_PER_MM, _STRICTEST_MM = 0.06, 3.0, 0.6
 # Maximum fraction of a component's crown-gum border that has no crease (median over a dental arch) for the components
-# to be treated as crowns with gum. Observed: 0.02 to 0.162 for synthetic crowns with a collar of gum (58 scans of 5,000
-# faces or more); 0.8 to 1.0 for synthetic crowns without gum; 0.24 to 0.34 for real crowns without gum; 0.167 for one
-# scan recorded from the root side, on which grooves and necks resemble short creases.
+# to be treated as crowns with gum. Observed: 0.02 to 0.162 with a collar of gum (58 scans); without gum, 0.24 to 1.0,
+# and 0.167 for one scan from the root side, whose grooves and necks resemble short creases.
 _MOST_WEAK = 0.165
 # Median edge length above which creases at the gum line are not resolved, so that crowns may include gum.
 _COARSE_MM = 1.2

@@ -35,64 +35,46 @@ _FILES = ("colours_0.npz", "colours_1.npz")
 class SegmentationConfig:
     """Configuration of the segmentation; lengths in px are pixels of the working image."""
 
-    # Working resolution at the teeth [px/mm], the same as that of the tracker.
+    # working resolution at the teeth, the same as that of the tracker
     working_px_per_mm: float = 7.2
-    # Margin around the projected crowns [mm], which includes lips, gum and tongue, but no background.
-    margin_mm: float = 4.0
-    # Minimum distance of training pixels of the tooth colours from the outline of the projected crowns, towards the
-    # inside [mm]; larger than the pose error.
-    inner_mm: float = 0.4
-    # Minimum distance of training pixels of the surrounding colours from the outline of the projected crowns, towards
-    # the outside [mm].
-    outer_mm: float = 1.0
-    # Maximum distance of tooth pixels outside the projected crowns [mm], in the first iteration and after alignment.
+    margin_mm: float = 4.0  # margin around the projected crowns: lips, gum and tongue, but no background
+    inner_mm: float = 0.4  # minimum distance of tooth colours learned inside the projected crowns; above the pose error
+    outer_mm: float = 1.0  # minimum distance of surrounding colours learned outside the projected crowns
+    # maximum distance of tooth pixels outside the projected crowns, in the first iteration and after alignment
     reach_mm: tuple[float, ...] = (1.6, 1.0)
-    # Time constant of the colour histograms [frames]; the light changes slowly, as the head moves.
-    memory_frames: float = 24.0
-    # The log-odds of tooth colours must exceed this quantile of the log-odds in the surroundings [-]: a quantile, since
-    # the separability of colours differs between subjects.
+    memory_frames: float = 24.0  # time constant of the colour histograms; the light changes slowly, as the head moves
+    # quantile of the log-odds in the surroundings that those of tooth colours must exceed [-], as the separability of
+    # colours differs between subjects; and margin that is added to it where position gives no evidence [-]
     surroundings_share: float = 0.95
-    # Margin that is added to this quantile where position gives no evidence [-].
     doubt: float = 1.5
-    # Minimum and maximum of the required log-odds [-].
-    doubt_range: tuple[float, float] = (-1.0, 1.0)
-    # Increase of the log-odds of tooth per mm inside the projected outline [1/mm]; their minimum outside and their
-    # maximum inside [-].
+    doubt_range: tuple[float, float] = (-1.0, 1.0)  # minimum and maximum of the required log-odds [-]
+    # increase of the log-odds of tooth per mm inside the projected outline [1/mm]; their minimum outside and their
+    # maximum inside [-]
     place_per_mm: float = 2.0
     place_most: tuple[float, float] = (1.5, 1.0)
-    # Cost of a border per pixel of its length, in log-odds [-], and fraction of this cost that applies on the strongest
-    # edges.
+    # cost of a border per pixel of its length, in log-odds [-], and fraction of it that applies on the strongest edges
     border: float = 4.0
     border_on_edge: float = 0.15
-    # Log-odds of upper against lower arch per mm of distance from their projected common border [1/mm]; segment.json
-    # uses the name of this setting.
+    # log-odds of upper against lower arch per mm of distance from their projected common border [1/mm]
     rows_per_mm: float = 2.0
-    # Maximum displacement of a border by refinement, and width of the area on each side in which colours are compared
-    # [mm].
+    # maximum displacement of a border by refinement, and width on each side in which colours are compared
     border_band_mm: float = 0.4
     border_side_mm: float = 0.8
-    # Sigma of the blur of the compared colours [px], and minimum colour separation at a visible border in standard
-    # deviations [-].
-    border_blur_px: float = 0.7
-    border_contrast: float = 2.0
-    # Outward shift of the outlines of the upper and lower arch [-], learned from annotated masks; 1 is the width of the
-    # soft border, about 3 px.
+    border_blur_px: float = 0.7  # sigma of the blur of the compared colours
+    border_contrast: float = 2.0  # minimum colour separation at a visible border in standard deviations [-]
+    # outward shift of the outlines of the upper and lower arch, learned from annotated masks, in widths of the soft
+    # border, about 3 px [-]
     wider: tuple[float, float] = (0.0, 0.0)
-    # Minimum fraction of a part's outline on visible edges [-], and minimum area of a part [px]; other parts are
-    # discarded.
+    # minimum fraction of a part's outline on visible edges [-], and minimum area of a part; others are discarded
     founded_share: float = 0.5
     speck_px: int = 25
-    # Number of iterations of the cut.
-    steps: int = 40
-    # Search range for the border between the arches [mm], and number of iterations of the cut that finds it.
-    arch_band_mm: float = 1.0
-    arch_steps: int = 60
-    # Weight of an annotated mask in the colour histograms, as a number of frames.
-    key_weight: float = 12.0
-    # Intersection over union with a finished mask below which the finished mask replaces the segmentation [-].
+    steps: int = 40  # number of iterations of the cut
+    arch_band_mm: float = 1.0  # search range for the border between the arches
+    arch_steps: int = 60  # number of iterations of the cut that finds it
+    key_weight: float = 12.0  # weight of an annotated mask in the colour histograms, as a number of frames
+    # intersection over union with a finished mask below which the finished mask replaces the segmentation [-]
     key_overlap: float = 0.8
-    # Minimum area of a mask [px], equal to 4 square millimetres.
-    least_px: int = 200
+    least_px: int = 200  # minimum area of a mask, equal to 4 square millimetres
 
 
 class ColourModel:
