@@ -24,7 +24,7 @@ from jawusd.base.arrays import Array
 from jawusd.base.errors import CalibrationError
 from jawusd.base.inputs import check_input
 from jawusd.base.tables import read_text
-from jawusd.geometry import Camera, make_transform, rigidity_defect
+from jawusd.geometry import Camera, make_transform, orthonormalise, rigidity_defect, se3_inverse
 from jawusd.geometry.camera import opencv_radial
 
 Size = tuple[int, int]
@@ -170,11 +170,10 @@ def world_to_camera(path: Path, name: str, rotation: Array, centre: Array) -> Ar
     Raises:
         CalibrationError: the axes are not orthonormal.
     """
-    if rigidity_defect(make_transform(rotation, np.zeros(3))) > _LARGEST_DEFECT:
+    T_world_cam = make_transform(rotation, centre)
+    if rigidity_defect(T_world_cam) > _LARGEST_DEFECT:
         raise CalibrationError(f"camera {name} has a rotation that is not orthonormal.", path=path)
-    u, _, vt = np.linalg.svd(rotation)
-    exact = u @ vt
-    return make_transform(exact.T, -exact.T @ centre)
+    return se3_inverse(orthonormalise(T_world_cam))
 
 
 def lens_with_k4(path: Path, name: str, K: Array, size: Size, radial: Array, tangential: tuple[float, float]) -> Array:

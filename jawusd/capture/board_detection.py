@@ -301,10 +301,10 @@ def _read(path: Path) -> NDArray[np.uint8]:
     if image is not None:
         return image
     try:  # OpenCV does not read EXR and DPX
-        stored = read_stored(path)
+        stored, white = read_stored(path)
     except CaptureError as error:
         raise CaptureError("is not a readable image.", path=path, hint="Use PNG, JPEG, TIFF, EXR or DPX.") from error
-    shown = to_display(stored.pixels, stored.largest, read_header(path).colour_space, None)
+    shown = to_display(stored, white, read_header(path).colour_space, None)
     return shown if shown.ndim == 2 else np.asarray(cv2.cvtColor(shown, cv2.COLOR_RGB2GRAY), np.uint8)
 
 

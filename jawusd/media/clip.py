@@ -98,7 +98,6 @@ class VideoFrame:
     """One decoded image of a clip."""
 
     index: int  # index of the image in presentation order, from 0
-    time_s: float  # presentation time relative to the first image [s]
     image: NDArray[np.uint8]  # pixels (h, w) gray, (h, w, 3) RGB or (h, w, 4) RGBA, uint8, read-only
 
 

@@ -19,8 +19,8 @@ from jawusd.base.errors import CaptureError, naming_file
 from jawusd.formats.clips import ClipSource
 from jawusd.formats.file_names import is_pattern, numbered_files
 from jawusd.media.clip import Clip, Timeline, VideoFrame
-from jawusd.media.pictures import StoredPicture, read_header, read_stored
-from jawusd.media.pixels import Colour, coloured, to_display
+from jawusd.media.pictures import read_header, read_stored
+from jawusd.media.pixels import Colour, Stored, coloured, to_display
 from jawusd.media.video import Video
 
 #: Frame rate [Hz] if neither the capture nor the files state one.
@@ -60,34 +60,30 @@ class PictureSequence(Clip):
         self.timecode_fps = self.fps / math.ceil(self.fps / _FASTEST_COUNT - 0.01)
         self.pixel_aspect = header.pixel_aspect
         self._space = source.colour_space or header.colour_space
-        first = read_stored(self._files[0][1])
-        height, width = first.pixels.shape[:2]
+        first, _ = read_stored(self._files[0][1])
+        height, width = first.shape[:2]
         self.size_px = (width, height)
-        self.is_fractional = first.pixels.dtype.kind == "f"
-        self.has_alpha, self.is_gray, self.is_rgb = False, first.pixels.ndim == 2, first.pixels.ndim == 3
+        self.is_fractional = first.dtype.kind == "f"
+        self.has_alpha, self.is_gray, self.is_rgb = False, first.ndim == 2, first.ndim == 3
 
-    def stored(self, index: int) -> StoredPicture:
-        """Return an image as stored.
-
-        Raises:
-            CaptureError: the image cannot be read, or differs in size from the first image.
-        """
-        found = read_stored(self._files[index][1])
-        if found.pixels.shape[1::-1] != self.size_px:
-            height, width = found.pixels.shape[:2]
+    def _stored(self, index: int) -> tuple[Stored, int]:
+        """Return an image as stored, and the value of white; raise CaptureError if it differs in size."""
+        pixels, white = read_stored(self._files[index][1])
+        if pixels.shape[1::-1] != self.size_px:
+            height, width = pixels.shape[:2]
             raise CaptureError(
                 f"is {width} x {height} px, but the first image is {self.size_px[0]} x {self.size_px[1]} px.",
                 path=self._files[index][1],
             )
-        return found
+        return pixels, white
 
     def light(self, index: int) -> NDArray[np.float32]:
         """Return a floating-point image as linear light, (h, w, 3) RGB float32.
 
         Raises:
-            CaptureError: see `stored`.
+            CaptureError: the image cannot be read, or differs in size from the first image.
         """
-        pixels = np.asarray(self.stored(index).pixels, np.float32)
+        pixels = np.asarray(self._stored(index)[0], np.float32)
         return pixels if pixels.ndim == 3 else np.repeat(pixels[..., None], 3, axis=2)
 
     def _converted(self, first: int, last: int, colour: Colour, threads: int) -> Iterator[VideoFrame]:
@@ -108,12 +104,12 @@ class PictureSequence(Clip):
                 pool.shutdown(wait=False, cancel_futures=True)
 
     def _frame(self, index: int, colour: Colour) -> VideoFrame:
-        stored = self.stored(index)
+        stored, white = self._stored(index)
         with naming_file(self.path):
-            shown = to_display(stored.pixels, stored.largest, self._space, self._source.colour_config)
+            shown = to_display(stored, white, self._space, self._source.colour_config)
         image = coloured(shown, colour)
         image.flags.writeable = False
-        return VideoFrame(index, float(self.times_s[index]), image)
+        return VideoFrame(index, image)
 
 
 _MOST_SKIPPED = 24  # maximum number of images to skip by decoding; beyond that, seeking is faster

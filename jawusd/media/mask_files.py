@@ -33,15 +33,11 @@ class PngMasks:
     def __init__(
         self,
         pattern: Path,
-        size_px: tuple[int, int] | None,
+        size_px: tuple[int, int],
         labels: LabelValues | None = None,
         is_other: Callable[[RawImage], bool] | None = None,
     ) -> None:
-        """Find the files of a pattern; see `numbered_files`.
-
-        Args:
-            size_px: (width, height) of all files, if known.
-            is_other: detects images that are not masks; these are not used to find the levels.
+        """Find the files (width, height) of a pattern; `is_other` detects those that do not tell levels of masks.
 
         Raises:
             CaptureError: the folder is missing, or contains no file of this pattern.
@@ -65,9 +61,8 @@ class PngMasks:
             CaptureError: the images have the wrong size or are not masks.
         """
         found = png_levels([self._path(k) for k in sorted(self._names)], self._is_other)
-        if self._size_px is not None:
-            for path, size in found.sizes_px:
-                _check_size(path, size, self._size_px)
+        for path, size in found.sizes_px:
+            _check_size(path, size, self._size_px)
         return found
 
     def masks(self, first: int) -> Iterator[MaskImage | None]:
@@ -81,37 +76,22 @@ class PngMasks:
                 yield None
                 continue
             path = self._path(number)
+            image = load_png(path)
+            _check_size(path, image.shape[1::-1], self._size_px)
             if self._labels is not None:
-                image = self._load(path)
                 image = image if image.ndim == 2 else read_palette_numbers(path, image)
                 yield _labelled(image, self._labels, path, "")
+            elif self.levels.levels is None:
+                yield None
             else:
-                yield self._mask(path, number)
-
-    def _mask(self, path: Path, number: int) -> MaskImage | None:
-        image, found = self._load(path), self.levels
-        if found.levels is None:
-            return None
-        if found.palette_numbers:
-            image = read_palette_numbers(path, image)
-        mask, odd = found.levels.coverage(image)
-        if odd:
-            self.odd[number] = f"{path.name} {odd}"
-        return mask
-
-    def first_size_px(self) -> tuple[int, int]:
-        """Return the (width, height) of the first file."""
-        height, width = self._load(self._path(min(self._names))).shape[:2]
-        return width, height
+                image = read_palette_numbers(path, image) if self.levels.palette_numbers else image
+                mask, odd = self.levels.levels.coverage(image)
+                if odd:
+                    self.odd[number] = f"{path.name} {odd}"
+                yield mask
 
     def _path(self, number: int) -> Path:
         return self._pattern.parent / self._names[number]
-
-    def _load(self, path: Path) -> RawImage:
-        image = load_png(path)
-        if self._size_px is not None:
-            _check_size(path, image.shape[1::-1], self._size_px)
-        return image
 
 
 class VideoMasks:

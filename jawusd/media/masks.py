@@ -15,11 +15,12 @@ from types import TracebackType
 from jawusd.base.errors import CaptureError
 from jawusd.formats.capture import CameraSource
 from jawusd.formats.clips import ClipSource
-from jawusd.formats.file_names import is_pattern
+from jawusd.formats.file_names import is_pattern, numbered_files
 from jawusd.media.clip import Timeline
 from jawusd.media.footage import open_clip
 from jawusd.media.mask_files import LabelValues, OneMask, PngMasks, VideoMasks
 from jawusd.media.mask_levels import MaskImage, MaskLevels
+from jawusd.media.mask_source import load_png
 from jawusd.media.video import Video
 
 _LOOKED_AT = 10  # number of label images that are sampled
@@ -263,7 +264,8 @@ def mask_size_px(path: str | os.PathLike[str]) -> tuple[int, int]:
     path = Path(path)
     if not is_pattern(path):
         return Video(path).size_px
-    return PngMasks(path, None).first_size_px()
+    height, width = load_png(next(iter(numbered_files(path).values()))).shape[:2]
+    return width, height
 
 
 class _Ahead:

@@ -86,14 +86,6 @@ def read_palette_numbers(path: Path, picture: RawPicture) -> RawPicture:
         return np.asarray(image, np.uint8) if image.mode == "P" else picture
 
 
-@dataclass(frozen=True, eq=False)
-class StoredPicture:
-    """Image as stored in a file: (h, w) or (h, w, 3) RGB; integers 0 to `largest`, or floating point."""
-
-    pixels: Stored
-    largest: int
-
-
 @dataclass(frozen=True)
 class PictureHeader:
     """Metadata of an image file; "" or None if missing."""
@@ -104,8 +96,8 @@ class PictureHeader:
     colour_space: str | None = None
 
 
-def read_stored(path: Path) -> StoredPicture:
-    """Read an image file.
+def read_stored(path: Path) -> tuple[Stored, int]:
+    """Return the pixels of an image file as stored, (h, w) or (h, w, 3) RGB, and the integer value of white.
 
     Raises:
         CaptureError: the file is missing, damaged, or not an image.
@@ -114,8 +106,8 @@ def read_stored(path: Path) -> StoredPicture:
     try:
         with open_container(path, PICTURES, MOST_STORED_PX) as container:
             frame = next(container.decode(video=0))
-            pixels, largest = _stored_pixels(frame)
-            return StoredPicture(np.rot90(pixels, _quarters(path)), largest)
+            pixels, white = _stored_pixels(frame)
+            return np.rot90(pixels, _quarters(path)), white
     except MemoryError as error:
         raise CaptureError("there is not enough memory for the image.", path=path, hint=_HINT) from error
     except (av.FFmpegError, OSError, StopIteration, IndexError, ValueError) as error:

@@ -96,8 +96,8 @@ class Video(Clip):
         with naming_file(path):
             self.rotation_deg = turn_deg(first)
         aspect = float(stored_aspect or 1) or 1.0  # an aspect ratio of 0 means unknown
-        self.pixel_aspect = 1 / aspect if self.rotation_deg in (90, 270) else aspect
         turned = self.rotation_deg in (90, 270)
+        self.pixel_aspect = 1 / aspect if turned else aspect
         self.size_px = (first.height, first.width) if turned else (first.width, first.height)
         stored_as = first.format
         self.has_alpha = self._alpha_decoder is not None or any(part.is_alpha for part in stored_as.components)
@@ -124,7 +124,7 @@ class Video(Clip):
         for index, frame in self._decode(first, last, threads, alpha=colour == "rgba"):
             image = self._image(frame, colour)
             image.flags.writeable = False  # the gray buffer may be a reference image of the decoder, so it is read-only
-            yield VideoFrame(index, float(self.times_s[index]), image)
+            yield VideoFrame(index, image)
 
     def _image(self, frame: av.VideoFrame, colour: Colour) -> NDArray[np.uint8]:
         if self._space is None:

@@ -70,7 +70,10 @@ def find_joints(skull: Mesh, mandible: Mesh, landmarks: Array, T_anatomical_skul
     left, right = (_joint(above, below, head) for head in heads)
     closed = np.array([float(pair.depth(np.eye(4)[None])[0]) for pair in (left, right)])
     for pair, depth in zip((left, right), closed):
-        _check_near(pair, depth)
+        if depth <= -FARTHEST_MM:
+            gap, _ = cKDTree(pair.upper.samples.points).query(pair.lower.samples.points)
+            if gap.min() > _WIDEST_MM:
+                raise NoContact(f"a condyle is {gap.min():.1f} mm from the skull; at most {_WIDEST_MM:g} mm is allowed")
     if closed.max() > _DEEPEST_MM:
         raise NoContact(
             f"in occlusion, a condyle penetrates the skull by {closed.max():.1f} mm; at most "
@@ -86,15 +89,6 @@ def _joint(above: Array, below: Array, head: Array) -> Pair:
     _check_fine("skull", above, fossa)
     upper = wound_solid("skull", above, 1.0, fossa, _GRID_MM)
     return Pair(upper, wound_solid("mandible", below, -1.0, condyle, _GRID_MM))
-
-
-def _check_near(pair: Pair, depth_mm: float) -> None:
-    """Raise NoContact if a condyle is too far from the skull, given its penetration depth."""
-    if depth_mm > -FARTHEST_MM:
-        return
-    gap, _ = cKDTree(pair.upper.samples.points).query(pair.lower.samples.points)
-    if gap.min() > _WIDEST_MM:
-        raise NoContact(f"a condyle is {gap.min():.1f} mm from the skull; at most {_WIDEST_MM:g} mm is allowed")
 
 
 def _check_fine(name: str, corners: Array, box: Array) -> None:

@@ -16,7 +16,7 @@ from jawusd.media.pixels import ColourPicture
 from jawusd.segmentation.arches import Expectation, ScanSurface, Seeds, expect_crowns
 from jawusd.segmentation.colours import ColourModel, SegmentationConfig
 from jawusd.segmentation.files import Key
-from jawusd.segmentation.learn import Example, cut_picture
+from jawusd.segmentation.learn import Example, cut_picture, overlap
 from jawusd.segmentation.picture import PictureFrame, Window
 
 _ARCHES = (0, 1)
@@ -101,7 +101,7 @@ class CameraSegmenter:
         guide = None if drawn is not None else seeds
         # Refine the borders in the first iteration, too; with rough outlines, the tracker would report a lost arch.
         shares, clear = cut_picture(window, expected, self.colours, c, self._frame.px_per_mm, reach, guide)
-        if drawn is not None and _overlap(shares, drawn) < c.key_overlap:
+        if drawn is not None and min(map(overlap, shares, drawn)) < c.key_overlap:
             shares = drawn
         masks = np.round(255 * shares).astype(np.uint8)
         present = np.array([(mask > 127).sum() >= c.least_px for mask in masks])
@@ -168,12 +168,6 @@ class CameraSegmenter:
             if inner.any() and outer.any():
                 out[r] = share[inner].mean() - share[outer].mean()
         return out
-
-
-def _overlap(shares: NDArray[np.float32], drawn: NDArray[np.float32]) -> float:
-    """Return the intersection over union of a segmentation and its annotation; the lower value of the two arches."""
-    a, b = shares > 0.5, drawn > 0.5
-    return float(((a & b).sum((1, 2)) / np.maximum((a | b).sum((1, 2)), 1)).min())
 
 
 def _outline(masks: NDArray[np.uint8], clear: Mask) -> NDArray[np.int64]:

@@ -106,15 +106,16 @@ def _widened(shares: NDArray[np.float32], wider: tuple[float, float]) -> NDArray
 
 
 def _best_width(found: Sequence[NDArray[np.float32]], drawn: Sequence[NDArray[np.float32]]) -> float:
-    losses = [np.mean([_loss(f + w, d) for f, d in zip(found, drawn, strict=True)]) for w in _WIDER]
+    losses = [np.mean([1 - overlap(f + w, d) for f, d in zip(found, drawn, strict=True)]) for w in _WIDER]
     return float(_WIDER[int(np.argmin(losses))])
 
 
 def _disagreement(examples: Sequence[Example], cuts: Sequence[NDArray[np.float32]]) -> float:
     pairs = [(cut[r], e.drawn[r]) for cut, e in zip(cuts, examples, strict=True) for r in (0, 1)]
-    return float(np.mean([_loss(found, drawn) for found, drawn in pairs]))
+    return float(np.mean([1 - overlap(found, drawn) for found, drawn in pairs]))
 
 
-def _loss(found: NDArray[np.float32], drawn: NDArray[np.float32]) -> float:
+def overlap(found: NDArray[np.float32], drawn: NDArray[np.float32]) -> float:
+    """Return the intersection over union of two coverages, shape (h, w)."""
     a, b = found > 0.5, drawn > 0.5
-    return 1 - (a & b).sum() / max(1, (a | b).sum())
+    return float((a & b).sum() / max(1, (a | b).sum()))

@@ -78,7 +78,7 @@ def test_huge_frames_of_sequences_are_refused_before_they_are_decoded(suffix, tm
         stream.width, stream.height, stream.pix_fmt = 64, 80, kind
         frame = av.VideoFrame.from_ndarray(np.zeros((80, 64, 3), np.uint8), "rgb24").reformat(format=kind)
         out.mux([*stream.encode(frame), *stream.encode(None)])
-    assert pictures.read_stored(path).pixels.shape == (80, 64, 3)
+    assert pictures.read_stored(path)[0].shape == (80, 64, 3)
     monkeypatch.setattr(pictures, "MOST_STORED_PX", 64 * 80 - 1)
     with pytest.raises(CaptureError, match="more than 5119 px"):
         pictures.read_stored(path)

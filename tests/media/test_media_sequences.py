@@ -135,7 +135,7 @@ def test_an_opencolorio_config_is_used(images, tmp_path):
     shown = next(open_clip(source).frames(colour="rgb")).image
     display = config.getDefaultDisplay()
     transform = ocio.DisplayViewTransform("Linear Rec.709 (sRGB)", display, config.getDefaultView(display))
-    wanted = read_stored(tmp_path / "take.1001.exr").pixels.astype(np.float32)
+    wanted = read_stored(tmp_path / "take.1001.exr")[0].astype(np.float32)
     config.getProcessor(transform).getDefaultCPUProcessor().applyRGB(wanted)
     assert np.abs(shown - 255 * np.clip(wanted, 0, 1)).max() <= 0.51
     with pytest.raises(CaptureError, match="cannot convert"):
@@ -152,7 +152,7 @@ def test_headers_of_exr_and_dpx(images, tmp_path):
     found = read_header(exr)
     assert found.timecode == "01:02:23;24"
     assert found.fps == pytest.approx(23.976, abs=1e-3)
-    assert read_stored(exr).pixels.shape == (48, 64, 3)  # still a picture
+    assert read_stored(exr)[0].shape == (48, 64, 3)  # still a picture
     dpx = write_picture(tmp_path / "a.dpx", images[0], "dpx10")
     data = bytearray(dpx.read_bytes())
     order = ">" if data[:4] == b"SDPX" else "<"

@@ -99,7 +99,7 @@ def test_plates_of_light_are_light(capture, tmp_path):
     patterns = write_plates(opened, OFFSETS, FRAMES, tmp_path / "rig", lambda *_: None)
     assert patterns == [LIGHT_PLATE.format(name="left"), PLATE.format(name="right")]
     for frame in FRAMES:
-        light = read_stored(tmp_path / "rig" / (patterns[0] % frame)).pixels.astype(np.float32)
+        light = read_stored(tmp_path / "rig" / (patterns[0] % frame))[0].astype(np.float32)
         weight = np.clip(light.mean(-1) - 0.2, 0, None)
         y, x = np.mgrid[: weight.shape[0], : weight.shape[1]]
         centre = np.array([(weight * x).sum(), (weight * y).sum()]) / weight.sum()
