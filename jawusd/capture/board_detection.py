@@ -121,14 +121,6 @@ def _markers(picture: NDArray[np.uint8]) -> Iterable[tuple[str, int]]:
             yield family, int(numbers.max())
 
 
-def corners_and_width(search: Search, image: NDArray[np.uint8], boards: Boards) -> tuple[Array, float]:
-    """Return the board corners in an image, shape (N, 2), and the edge width [px]; all NaN if there is no board."""
-    corners = search(image)
-    if corners is None:
-        return np.full((boards.cols * boards.rows, 2), np.nan), np.nan
-    return corners, edge_width_px(image, corners, boards.cols)
-
-
 def _chessboard(boards: Boards) -> Search:
     def look(image: NDArray[np.uint8]) -> Array | None:
         ok, corners, meta = cv2.findChessboardCornersSBWithMeta(image, (boards.cols, boards.rows), flags=_FLAGS)

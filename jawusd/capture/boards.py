@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from jawusd.base.arrays import Array, Mask
 from jawusd.base.errors import CalibrationError
-from jawusd.capture.board_detection import BoardClip, corners_and_width, detector, different_board, sharpness
+from jawusd.capture.board_detection import BoardClip, detector, different_board, edge_width_px, sharpness
 from jawusd.formats.capture import Boards
 from jawusd.media.clip import INTERLACED, INTERLACED_HINT
 
@@ -68,9 +68,13 @@ def find_boards(names: tuple[str, ...], boards: Boards, progress: Callable[[int,
 
     def search(clip: BoardClip) -> list[tuple[Array, float]]:
         nonlocal done
-        one, found = detector(boards), []
+        one, found = detector(boards), list[tuple[Array, float]]()
         for _, image in clip.pictures(chosen):
-            found.append(corners_and_width(one, image, boards))
+            corners = one(image)
+            if corners is None:
+                found.append((np.full((boards.cols * boards.rows, 2), np.nan), np.nan))
+            else:
+                found.append((corners, edge_width_px(image, corners, boards.cols)))
             done += 1
             progress(done, total)
         return found

@@ -70,20 +70,6 @@ class Normal(NamedTuple):
 
 
 @device
-def normal_scratch() -> Normal:
-    """Allocate the scratch memory for the normal equations of one search."""
-    return Normal(
-        np.empty((3, 3)),
-        np.empty(3),
-        np.empty((3, 3)),
-        np.empty(3),
-        np.empty((3, 3)),
-        np.empty(3),
-        np.empty(3),
-    )
-
-
-@device
 def equations(model: Array, problem: Problem, x: Array, w: Scratch, A: Array, g: Array) -> float:
     """Return the squared residual at x; write the normal matrix A (3, 3) and the gradient g (3,)."""
     A[:, :] = 0.0
@@ -166,7 +152,9 @@ class Encoding(NamedTuple):
 @device
 def encoding_scratch(model: Array) -> Encoding:
     """Allocate the scratch memory for encoding."""
-    return Encoding(scratch(model), normal_scratch(), np.empty((3, 4)), np.empty(3), np.empty((4, 4)))
+    A, g = np.empty((3, 3)), np.empty(3)
+    n = Normal(A, g, np.empty_like(A), np.empty_like(g), np.empty_like(A), np.empty_like(g), np.empty_like(g))
+    return Encoding(scratch(model), n, np.empty((3, 4)), np.empty(3), np.empty((4, 4)))
 
 
 @device

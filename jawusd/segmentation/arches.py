@@ -36,10 +36,6 @@ class ScanSurface:
         crown = crown_face_mask(mesh)
         return cls(mesh.vertices, mesh.faces[crown], mesh.faces[~crown])
 
-    def crown_points(self) -> Array:
-        """Return the vertices of the crowns [mm], shape (N, 3)."""
-        return self.vertices[np.unique(self.crown_faces)]
-
 
 @dataclass(frozen=True, eq=False)
 class Expectation:
@@ -52,13 +48,6 @@ class Expectation:
 
 def expect_crowns(scans: tuple[ScanSurface, ScanSurface], poses: Array, camera: Camera) -> Expectation:
     """Render both arches at poses (2, 4, 4), T_world_upper and T_world_lower, with a pinhole camera."""
-    labels = draw_crowns(scans, poses, camera)
-    away = np.stack([signed_distance(labels == label) for label in (UPPER, LOWER)])
-    return Expectation(labels, np.where(away > 0, away - np.float32(0.5), away + np.float32(0.5)))
-
-
-def draw_crowns(scans: tuple[ScanSurface, ScanSurface], poses: Array, camera: Camera) -> NDArray[np.uint8]:
-    """Return the label of every pixel, UPPER or LOWER where a crown is visible, otherwise OTHER; shape (h, w)."""
     width, height = camera.size_px
     inverse_depth, labels = np.zeros((height, width), np.float32), np.zeros((height, width), np.uint8)
     for scan, pose, label in zip(scans, poses, (UPPER, LOWER), strict=True):
@@ -66,7 +55,8 @@ def draw_crowns(scans: tuple[ScanSurface, ScanSurface], poses: Array, camera: Ca
         points = np.column_stack([camera.project_pinhole(world), camera.depth(world)]).astype(np.float32)
         draw_depth_labels(points, scan.gum_faces, 0, 0, False, inverse_depth, labels, OTHER)
         draw_depth_labels(points, scan.crown_faces, 0, 0, False, inverse_depth, labels, label)
-    return labels
+    away = np.stack([signed_distance(labels == label) for label in (UPPER, LOWER)])
+    return Expectation(labels, np.where(away > 0, away - np.float32(0.5), away + np.float32(0.5)))
 
 
 @numba.njit(nogil=True, cache=True)

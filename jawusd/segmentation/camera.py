@@ -65,7 +65,7 @@ class CameraSegmenter:
         self._config = config
         upper, lower = meshes
         self._scans = ScanSurface.of(upper), ScanSurface.of(lower)
-        self._points = [scan.crown_points()[::_EVERY] for scan in self._scans]
+        self._points = [scan.vertices[np.unique(scan.crown_faces)[::_EVERY]] for scan in self._scans]
         self._frame = PictureFrame(source, self._around(poses).mean(0), config.working_px_per_mm)
         self.colours = ColourModel(config.memory_frames)
 

@@ -40,8 +40,7 @@ class Recording:
 
     controls: Array  # opening 0..1, lateral -1..1, protrusion -1..1, shape (F, 3)
     phase: NDArray[np.str_]  # name of the exercise of each frame, shape (F,)
-    T_manifold: Array  # poses determined by the controls alone
-    T_true: Array  # `T_manifold` with small movements outside the controls
+    T_true: Array  # poses of the controls with small movements outside them
     T_noisy: Array  # `T_true` with tracking noise
 
 
@@ -65,8 +64,7 @@ def record(person: Person, n_frames: int, seed: int, kind: Kind = "training", no
     controls = person.limit(curves + unintended)
     extra_mm = smooth_noise(rng, n_frames, 8.0, 3) * [person.noise.side_mm, person.noise.lift_mm, person.noise.lift_mm]
     T_true = person.pose_with_extra(controls, extra_mm)
-    T_noisy = _with_tracking_noise(person, T_true, rng, noise_scale)
-    return Recording(controls, phase, person.pose(*controls.T), T_true, T_noisy)
+    return Recording(controls, phase, T_true, _with_tracking_noise(person, T_true, rng, noise_scale))
 
 
 def schedule(

@@ -57,7 +57,7 @@ class Captured:
         self.donor = Donor(f"person {seed}", JawRig(model.arrays, model.meta))
         self.d = self.donor.rig.encode(self.poses)[0]
         self.shares = self.donor.rig.normalized(self.d)
-        self.d_clean = self.donor.rig.encode(take.T_manifold)[0]
+        self.d_clean = self.donor.rig.encode(self.person.pose(*take.controls.T))[0]
 
     def error(self, poses: np.ndarray) -> np.ndarray:
         """Return the mean vertex distance of poses from the captured ones [mm], shape (FRAMES,)."""
