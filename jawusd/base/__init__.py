@@ -1,4 +1,1 @@
-"""The foundation of all layers: exceptions, version, safe readers of npz and tables, input checks, the schema's path.
-
-May import only the standard library and numpy.
-"""
+"""The foundation of all layers: exceptions, version, readers of npz and tables, input checks, the schema's path."""

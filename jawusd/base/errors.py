@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator
 from functools import partial
 from os import PathLike
 
+_OF_BUILD = "PIL av cv2 jinja2 matplotlib numba onnx onnxruntime pyfqmr scipy shapely torch trimesh"
 _EXTRA_OF_PACKAGE = {
     "moderngl": "demo",
     "viser": "view",
@@ -20,24 +21,7 @@ _EXTRA_OF_PACKAGE = {
     "pythonosc": "live",
     "dask": "many",
     "distributed": "many",
-    **dict.fromkeys(
-        (
-            "PIL",
-            "av",
-            "cv2",
-            "jinja2",
-            "matplotlib",
-            "numba",
-            "onnx",
-            "onnxruntime",
-            "pyfqmr",
-            "scipy",
-            "shapely",
-            "torch",
-            "trimesh",
-        ),
-        "build",
-    ),
+    **dict.fromkeys(_OF_BUILD.split(), "build"),
 }
 
 

@@ -33,39 +33,21 @@ _MOST_BYTES = 4 << 20
 _CLASSIC, _RADIAL = "3DE Classic LD Model", "3DE4 Radial - Standard, Degree 4"
 _BROWN, _OPENCV = "3DE4 Brown-Conrady, Degree 6/2", "OpenCV Radial Degree 6, Decentered Degree 2"
 # Parameters of each distortion model, with their default values; Nuke omits parameters that have the default value.
-_PARAMETERS: dict[str, dict[str, float]] = {
-    _CLASSIC: {
-        "Distortion": 0.0,
-        "Anamorphic Squeeze": 1.0,
-        "Curvature X": 0.0,
-        "Curvature Y": 0.0,
-        "Quartic Distortion": 0.0,
-    },
-    _RADIAL: dict.fromkeys(
-        (
-            "Distortion - Degree 2",
-            "U - Degree 2",
-            "V - Degree 2",
-            "Quartic Distortion - Degree 4",
-            "U - Degree 4",
-            "V - Degree 4",
-            "Phi - Cylindric Direction",
-            "B - Cylindric Bending",
-        ),
-        0.0,
+_NAMES = {
+    _CLASSIC: ("Distortion", "Anamorphic Squeeze", "Curvature X", "Curvature Y", "Quartic Distortion"),
+    _RADIAL: (
+        *("Distortion - Degree 2", "U - Degree 2", "V - Degree 2"),
+        *("Quartic Distortion - Degree 4", "U - Degree 4", "V - Degree 4"),
+        *("Phi - Cylindric Direction", "B - Cylindric Bending"),
     ),
-    _BROWN: dict.fromkeys(("C2", "C4", "C6", "T1", "T2"), 0.0),
-    _OPENCV: dict.fromkeys(
-        (
-            "Radial Distortion - Degree 2 - k1",
-            "Radial Distortion - Degree 4 - k2",
-            "Decentering Y - Degree 2 - p1",
-            "Decentering X - Degree 2 - p2",
-            "Radial Distortion - Degree 6 - k3",
-        ),
-        0.0,
+    _BROWN: ("C2", "C4", "C6", "T1", "T2"),
+    _OPENCV: (
+        *("Radial Distortion - Degree 2 - k1", "Radial Distortion - Degree 4 - k2"),
+        *("Decentering Y - Degree 2 - p1", "Decentering X - Degree 2 - p2", "Radial Distortion - Degree 6 - k3"),
     ),
 }
+_PARAMETERS = {model: dict.fromkeys(names, 0.0) for model, names in _NAMES.items()}
+_PARAMETERS[_CLASSIC]["Anamorphic Squeeze"] = 1.0
 _STATIC = ("0", "DISTORTION_STATIC")
 _FOV = {"xa": 0.0, "xb": 1.0, "ya": 0.0, "yb": 1.0}
 _LARGEST_ERROR_PX = 0.05

@@ -25,6 +25,12 @@ from jawusd.evaluator.nearest import (
 from jawusd.evaluator.verdicts import RIGID_TOLERANCE, Reason
 from jawusd.fast.hull import signed_distance
 from jawusd.fast.kinds import (
+    FROM_CLOSED,
+    GRID,
+    INCISOR,
+    STARTS,
+    TO_ANATOMICAL,
+    VECTORS,
     Scratch,
     displaced,
     motion,
@@ -32,14 +38,6 @@ from jawusd.fast.kinds import (
     motion_derivative,
     parameters_at,
     scratch,
-)
-from jawusd.fast.packing import (
-    FROM_CLOSED,
-    GRID,
-    INCISOR,
-    STARTS,
-    TO_ANATOMICAL,
-    VECTORS,
 )
 from jawusd.fast.rigid import Vector, device, solve
 

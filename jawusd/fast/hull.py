@@ -1,6 +1,6 @@
 """Compiled slice hull of `jawusd.evaluator.bounds`, for a single row of a batch.
 
-`bound` is the array from `packing.packed_bound`, `v` the scratch memory from `hull_scratch`.
+`bound` is the array from `packed_bound`, `v` the scratch memory from `hull_scratch`.
 """
 
 from __future__ import annotations
@@ -10,11 +10,24 @@ from math import exp, log
 import numpy as np
 
 from jawusd.base.arrays import Array
-from jawusd.fast.packing import HULL, MARGIN, ROUNDING, SIDES
+from jawusd.evaluator.bounds import SliceHull
+from jawusd.fast.kinds import curve_parts, joined
 from jawusd.fast.rigid import Vector, device, interval
+
+# offsets of the fields in a packed bound
+ROUNDING = 0  # `SliceHull.softness_mm`
+MARGIN = 1  # `SliceHull.offset_mm`
+SIDES = 2  # number k of half-planes
+HULL = 3  # normals of the half-planes, column-major (2, k), then the curve of the supports
 
 # Exponent, relative to the largest, below which a term is skipped: exp(-45) = 3e-20 is below rounding.
 _NEGLIGIBLE = 45.0
+
+
+def packed_bound(bound: SliceHull) -> Array:
+    """Return a packed bound."""
+    head = [np.array([bound.softness_mm, bound.offset_mm, len(bound.directions)]), bound.directions.T]
+    return joined([*head, curve_parts(bound.supports)])
 
 
 @device

@@ -20,9 +20,19 @@ from jawusd.evaluator.models import AnchoredModel, JawModelForm
 from jawusd.evaluator.motions import RigFrames
 from jawusd.evaluator.verdicts import Limits, Verdicts
 from jawusd.fast.encoding import encoding_scratch, judge
-from jawusd.fast.hull import hull_scratch, signed_distance, signed_distance_gradient
-from jawusd.fast.kinds import Scratch, motion, motion_derivative, parts_of, scratch
-from jawusd.fast.packing import ADJOINT, CLOSED, FROM_ANATOMICAL, GRID, joined, packed_bound
+from jawusd.fast.hull import hull_scratch, packed_bound, signed_distance, signed_distance_gradient
+from jawusd.fast.kinds import (
+    ADJOINT,
+    CLOSED,
+    FROM_ANATOMICAL,
+    GRID,
+    Scratch,
+    joined,
+    motion,
+    motion_derivative,
+    parts_of,
+    scratch,
+)
 from jawusd.fast.rigid import compiled, device, inverse_coefficient, product
 from jawusd.geometry.rodrigues import apply_series, cross, dot
 

@@ -1,10 +1,12 @@
-"""The compiled form of each kind of model: its part of the packed model, its motion and derivatives, for one d.
+"""The compiled form of each kind of model: its memory layout, its motion and derivatives, for one d.
 
-See `jawusd.evaluator.models`. `model` is the array from `kernels.packed_model`, `w` the scratch memory of one call.
+Passing an array to compiled code takes about as long as computing one pose, so each function receives a single flat
+array: `model` from `kernels.packed_model`. `w` is the scratch memory of one call. See `jawusd.evaluator.models`.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from math import sqrt
 from typing import NamedTuple
 
@@ -13,12 +15,11 @@ from numpy.typing import ArrayLike
 
 from jawusd.base.arrays import Array
 from jawusd.evaluator import gauge
-from jawusd.evaluator.curves import GlideTable
+from jawusd.evaluator.curves import GlideTable, HermiteCurve
 from jawusd.evaluator.formula import GaugeNumbers
 from jawusd.evaluator.gauge import gradient_by_u, spline_input
 from jawusd.evaluator.kinds import ADDITIVE, KINDS
 from jawusd.evaluator.models import AdditiveModel, AnchoredModel, JawModelForm
-from jawusd.fast.packing import COUNT, INCISOR, KIND, REST, curve_parts
 from jawusd.fast.rigid import (
     FLOATS,
     Vector,
@@ -32,6 +33,21 @@ from jawusd.fast.rigid import (
 from jawusd.geometry.rodrigues import angle_coefficients, apply_series, cross, dot
 
 _ADDITIVE = KINDS.index(ADDITIVE)
+
+# offsets of the fields in a packed model of any kind
+KIND = 0  # index into `evaluator.kinds.KINDS`
+COUNT = 1  # number of spline centres; 0 for models without a spline
+# number n of starting points of searches in d; 0 if searches run over the displacement of the incisal point
+STARTS = 2
+GRID = 3  # offset of the starting points: d (n, 3), then their incisal displacements (n, 3) [mm]
+INCISOR = 4  # incisal point at rest (3,) [mm]
+FROM_ANATOMICAL = 7  # matrix L (4, 4) in pose = L M Q, row-major
+CLOSED = 23  # matrix Q (4, 4) in pose = L M Q
+TO_ANATOMICAL = 39  # inverse of L (4, 4)
+FROM_CLOSED = 55  # inverse of Q (4, 4)
+ADJOINT = 71  # map (6, 6) of twists from the anatomical to the skull frame
+VECTORS = 107  # vectors (4, 4) that represent the landmarks; see `evaluator.encoding`
+REST = 123  # start of the part that depends on the kind of model
 
 # offsets of the fields in a packed anchored model
 SCALES = REST  # lengths dividing the sheared displacement (3,) [mm]
@@ -50,8 +66,18 @@ SPLINE = REST + 41  # centres, column-major (3, m), then kernel weights (m, 3), 
 CURVES = REST  # offsets at which the three curves start, then the curves
 
 
+def curve_parts(curve: HermiteCurve) -> Array:
+    """Return a packed curve: number of knots n, knots (n,), starts (n + 1,), coefficients (n + 1, 4, k)."""
+    return joined([[len(curve.knots)], curve.knots, curve.starts, curve.coefficients])
+
+
+def joined(parts: Iterable[ArrayLike]) -> Array:
+    """Return arrays flattened and joined."""
+    return np.concatenate([np.asarray(part, dtype=np.float64).ravel() for part in parts])
+
+
 def parts_of(model: JawModelForm) -> list[ArrayLike]:
-    """Return the part of a packed model that depends on the kind of model, which starts at `packing.REST`.
+    """Return the part of a packed model that depends on the kind of model, which starts at `REST`.
 
     Raises:
         TypeError: the kind of model has no compiled form.

@@ -105,7 +105,7 @@ def interval(knots: Array, count: int, x: float) -> int:
 
 @device
 def _glide(table: Array, d2: float, d3: float) -> Vector:
-    """Return the result of `curves.GlideTable.at_floats` for a table packed by `packing`; zeros without a table."""
+    """Return the result of `curves.GlideTable.at_floats` for a packed table (see `kinds`); zeros without a table."""
     count2, count3 = int(table[0]), int(table[1])
     if count2 == 0:
         return 0.0, 0.0, 0.0

@@ -10,7 +10,6 @@ from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
-from types import TracebackType
 
 from jawusd.base.errors import CaptureError
 from jawusd.formats.capture import CameraSource
@@ -150,9 +149,7 @@ class MaskReader:
     def __enter__(self) -> MaskReader:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def _results(self, first: int) -> Generator[MaskImage | None]:

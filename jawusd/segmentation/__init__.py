@@ -1,4 +1,1 @@
-"""Segment the teeth of both arches in footage, guided by the projected scans.
-
-The package writes mask files that the user can edit; it imports no other stage.
-"""
+"""Segment the teeth of both arches in footage, guided by the projected scans; masks are files that users can edit."""

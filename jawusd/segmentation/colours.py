@@ -6,7 +6,6 @@ masks as uninterrupted runs.
 
 from __future__ import annotations
 
-import io
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
@@ -16,7 +15,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jawusd.base.arrays import Array, Indices, Mask
-from jawusd.base.npz import DAMAGED
+from jawusd.base.errors import FormatError
+from jawusd.base.npz import read_arrays
 from jawusd.formats.atomic import write_npz_atomic
 
 _BINS = 32  # number of histogram bins per channel
@@ -226,21 +226,15 @@ class ColourStates:
         """Restore the colours saved last up to frame `done`; return their frame or None; step: 1 or -1 (backwards)."""
         for frame in (done, done - step):
             path = self._folder / _FILES[frame % 2]
-            kept = _stored(path)
-            if kept is None or (int(kept["frame"]), int(kept["step"])) != (frame, step):
+            try:
+                kept = read_arrays(path)
+            except FormatError:  # a missing or damaged file: its frames are processed again
+                continue
+            if (int(kept["frame"]), int(kept["step"])) != (frame, step):
                 continue
             for name, model in self._colours.items():
                 model.restore(np.asarray(kept[f"seen {name}"], np.int64), kept[f"counts {name}"])
             return frame
-        return None
-
-
-def _stored(path: Path) -> dict[str, Array] | None:
-    """Return the arrays of a state file; None if it is missing or corrupt, so that its frames are processed again."""
-    try:
-        with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as archive:
-            return {name: archive[name] for name in archive.files}
-    except (OSError, *DAMAGED):
         return None
 
 

@@ -1,4 +1,1 @@
-"""Synthetic subjects: jaw motion, anatomy, and rendered captures with ground truth.
-
-The kinematics are independent of the models that jawusd fits. This package imports no other stage.
-"""
+"""Synthetic subjects, independent of the models that jawusd fits: motion, anatomy, captures with ground truth."""
