@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from jawusd.base.arrays import Array
-from jawusd.base.errors import CalibrationError, FormatError, OutputError
+from jawusd.base.errors import CalibrationError, FormatError
 from jawusd.base.tables import is_number, read_text
 from jawusd.cameras.files import MOST_BYTES, CameraFormat, cameras_of_images, corner_matrix, files_in, numbers
 from jawusd.formats.atomic import write_text_atomic
@@ -153,10 +153,6 @@ def save_colmap(folder: Path, cameras: Sequence[Camera]) -> list[Path]:
         T = camera.T_cam_world
         pose = np.concatenate([wxyz_from_matrix(T[:3, :3]), T[:3, 3]])
         images += [f"{number} {' '.join(repr(float(value)) for value in pose)} {number} {camera.name}.png", ""]
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"cannot write here: {error.strerror}.", path=folder) from error
     texts = {"cameras.txt": lenses, "images.txt": images, "points3D.txt": ["# no points"]}
     for name, lines in texts.items():
         write_text_atomic(folder / name, "\n".join(lines) + "\n")

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from jawusd.base.arrays import Array, Mask
+from jawusd.base.arrays import Array
 from jawusd.base.errors import CalibrationError
 from jawusd.capture.board_detection import BoardClip, detector, different_board, edge_width_px, sharpness
 from jawusd.formats.capture import Boards
@@ -87,8 +87,16 @@ def find_boards(names: tuple[str, ...], boards: Boards, progress: Callable[[int,
     seen = np.isfinite(widths)
     for name, clip, mask in zip(names, clips, seen):
         _check_board(name, clip, chosen, boards, int(mask.sum()))
-    blurred = seen & (widths > _limits_px(widths)[:, None])
-    _check_blur(names, clips, widths, blurred)
+    limits = _limits_px(widths)
+    blurred = seen & (widths > limits[:, None])
+    for c in np.flatnonzero(seen.any(1) & (blurred == seen).all(1)):
+        raise CalibrationError(
+            f"all {seen[c].sum()} images of the board are blurred: its edges are {np.median(widths[c, seen[c]]):.1f} "
+            f"px wide (10 to 90 %); the limit is {limits[c]:.1f} px.",
+            camera=names[c],
+            path=clips[c].path,
+            hint="Film the board again: in focus, held still, with more light or a shorter exposure.",
+        )
     notes += [f"camera {name}: {INTERLACED}. {INTERLACED_HINT}" for name, c in zip(names, clips) if c.is_interlaced]
     corners[blurred] = np.nan
     used = (seen & ~blurred).any(0)
@@ -165,17 +173,3 @@ def _check_board(name: str, clip: BoardClip, chosen: list[int], boards: Boards, 
             hint="Check pattern and inner corners in [boards]; a chessboard must be fully in view, sharp, and have a "
             "white rim.",
         )
-
-
-def _check_blur(names: tuple[str, ...], clips: list[BoardClip], widths: Array, blurred: Mask) -> None:
-    """Raise an error if all images in which a camera sees the board are blurred."""
-    for name, clip, row, out, limit in zip(names, clips, widths, blurred, _limits_px(widths)):
-        seen = np.isfinite(row)
-        if seen.any() and out[seen].all():
-            raise CalibrationError(
-                f"all {seen.sum()} images of the board are blurred: its edges are "
-                f"{np.median(row[seen]):.1f} px wide (10 to 90 %); the limit is {limit:.1f} px.",
-                camera=name,
-                path=clip.path,
-                hint="Film the board again: in focus, held still, with more light or a shorter exposure.",
-            )

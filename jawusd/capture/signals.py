@@ -13,7 +13,6 @@ travels at 3 ms per metre, which causes errors for cameras that are metres apart
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,7 +56,7 @@ class Offset:
     exact_frames: float  # offset including its estimated sub-frame part
     spread_frames: float  # maximum deviation of a matched light step from exact_frames; 0 for sound
     matched_steps: int  # number of light steps found in both cameras; 0 for sound
-    confidence: float  # fraction of matched light steps, or `SoundMatch.confidence`; 0 to 1
+    confidence: float  # fraction of matched light steps, or see `match_sounds`; 0 to 1
 
 
 def find_steps(brightness: Array, first_frame: int = 0) -> list[Step]:
@@ -200,15 +199,10 @@ def _listed(steps: list[Step]) -> str:
     return ", ".join(f"{step.time_frames:.1f} ({'on' if step.rising else 'off'})" for step in steps)
 
 
-class SoundMatch(NamedTuple):
-    """Time offset between two sound recordings."""
+def match_sounds(sound: Sound, reference: Sound) -> tuple[float, float]:
+    """Return the time [s] of an event in the reference recording minus that in the other, and the confidence, 0 to 1.
 
-    delay_s: float  # time of an event in the reference recording minus its time in the other recording
-    confidence: float  # 1 minus the ratio of the second-highest correlation peak to the highest, 0 to 1
-
-
-def match_sounds(sound: Sound, reference: Sound) -> SoundMatch:
-    """Find the delay between two sound recordings of one scene.
+    The confidence is 1 minus the ratio of the second-highest correlation peak to the highest.
 
     Raises:
         SyncError: a recording is silent, the sounds do not match, or the delay is ambiguous.
@@ -243,4 +237,4 @@ def match_sounds(sound: Sound, reference: Sound) -> SoundMatch:
     bend = before - 2 * peak + after
     exact = lags[at] + (0.5 * (before - after) / bend if bend < 0 else 0.0)
     delay = exact / sound.rate_hz + reference.start_s - sound.start_s
-    return SoundMatch(float(delay), 1 - max(0.0, second) / peak)
+    return float(delay), 1 - max(0.0, second) / peak

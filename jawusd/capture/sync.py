@@ -167,9 +167,9 @@ def _stopped_early(videos: Mapping[str, Clip], offsets: Mapping[str, Offset], ra
 def _by_sound(name: str, reference: str, sounds: Mapping[str, Sound], videos: Mapping[str, Clip], fps: float) -> Offset:
     if name == reference:
         return Offset(0, 0.0, 0.0, 0, 1.0)
-    match = match_sounds(sounds[name], sounds[reference])
-    exact = (match.delay_s - videos[reference].start_s + videos[name].start_s) * fps
-    return Offset(round(exact), exact, 0.0, 0, match.confidence)
+    delay_s, confidence = match_sounds(sounds[name], sounds[reference])
+    exact = (delay_s - videos[reference].start_s + videos[name].start_s) * fps
+    return Offset(round(exact), exact, 0.0, 0, confidence)
 
 
 def _compared(

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
 from jawusd.base.arrays import Array, Mask
+from jawusd.formats.capture import Pick, PickView
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry import Camera, transform_points
 from jawusd.geometry.points import meet_triangles
@@ -85,14 +84,6 @@ def _ellipse(mask: Mask, row: float, column: float, radius: Array, value: bool) 
     mask[((y - row) / radius[0]) ** 2 + ((x - column) / radius[1]) ** 2 <= 1.0] = value
 
 
-@dataclass(frozen=True)
-class VisibleVertex:
-    """A vertex of a scan and its image points (camera, x, y) in two cameras."""
-
-    vertex: int
-    views: tuple[tuple[str, float, float], ...]
-
-
 def choose_picks(
     arch: DentalArch,
     T_world_arch: Array,
@@ -101,7 +92,7 @@ def choose_picks(
     count: int,
     noise_px: float,
     rng: np.random.Generator,
-) -> list[VisibleVertex]:
+) -> list[Pick]:
     """Choose `count` well-distributed tips and corners of teeth that are visible in at least two cameras.
 
     Args:
@@ -125,8 +116,8 @@ def choose_picks(
         views = []
         for c in sorted(np.argsort(-facing[k])[:2]):
             x, y = cameras[c].project(points[k]) + rng.normal(0.0, noise_px, 2)
-            views.append((cameras[c].name, float(x), float(y)))
-        picks.append(VisibleVertex(int(candidates[k]), tuple(views)))
+            views.append(PickView(camera=cameras[c].name, x=float(x), y=float(y)))
+        picks.append(Pick(vertex=int(candidates[k]), views=tuple(views)))
     return picks
 
 

@@ -14,11 +14,12 @@ from numpy.typing import ArrayLike, NDArray
 from jawusd.base.arrays import Array
 from jawusd.cameras.calibration import save_calibration
 from jawusd.formats.atomic import write_bytes_atomic, write_npz_atomic, write_text_atomic
+from jawusd.formats.capture import Pick
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry import LANDMARKS, Camera
 from jawusd.media.writers import VideoWriter
 from jawusd.synthetic.anatomy import build_anatomy
-from jawusd.synthetic.annotations import Outline, VisibleVertex, choose_picks, drawn_mask
+from jawusd.synthetic.annotations import Outline, choose_picks, drawn_mask
 from jawusd.synthetic.person import Person
 from jawusd.synthetic.render import Picture, Renderer
 from jawusd.synthetic.take import (
@@ -129,7 +130,7 @@ class _Recorder:
         self._rng = [np.random.default_rng([config.seed, 0xCA3, k]) for k in range(len(cameras))]
         shape = (_NOISE_PATTERNS, config.size_px[1], config.size_px[0], 3)
         self._grain = np.rint(self._rng[0].normal(0.0, _SENSOR_NOISE, shape)).astype(np.int8)
-        self.picks: dict[str, list[VisibleVertex]] = {}
+        self.picks: dict[str, list[Pick]] = {}
 
     def performance(self, scene: Scene, take: Take) -> None:
         """Record videos and masks of the exercises, and the picks in the first tracked frame."""
@@ -240,7 +241,7 @@ def _truth(person: Person, cameras: list[Camera], take: Take, T_world_board: Arr
     }
 
 
-def _description(config: DemoConfig, cameras: list[Camera], take: Take, picks: dict[str, list[VisibleVertex]]) -> str:
+def _description(config: DemoConfig, cameras: list[Camera], take: Take, picks: dict[str, list[Pick]]) -> str:
     """Return the text of capture.toml."""
     lines = [
         'format = "jawusd-capture/1"',
@@ -264,7 +265,7 @@ def _description(config: DemoConfig, cameras: list[Camera], take: Take, picks: d
     lines += ["[bootstrap]", f"frame = {take.tracked[0]}", ""]
     for jaw in ("upper", "lower"):
         for pick in picks[jaw]:
-            views = ", ".join(f'{{ camera = "{name}", x = {x:.2f}, y = {y:.2f} }}' for name, x, y in pick.views)
+            views = ", ".join(f'{{ camera = "{one.camera}", x = {one.x:.2f}, y = {one.y:.2f} }}' for one in pick.views)
             lines += [f"[[bootstrap.{jaw}]]", f"vertex = {pick.vertex}", f"views = [{views}]", ""]
     lines += ["[motion]", f"rest_frame = {take.rest_frame}", ""]
     return "\n".join(lines)

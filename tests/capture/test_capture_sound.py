@@ -44,10 +44,10 @@ def test_the_delay_is_found_to_a_fraction_of_a_frame(late_s: float) -> None:
     scene = speech(40, rate)
     a = resample_poly(heard(scene, 5.0, 20, rate, 1), 1, 4)
     b = resample_poly(heard(scene, 5.0 + late_s, 25, rate, 2), 1, 4)
-    found = match_sounds(Sound(b, RATE_HZ, 0.5), Sound(a, RATE_HZ, 0.0))
+    delay_s, confidence = match_sounds(Sound(b, RATE_HZ, 0.5), Sound(a, RATE_HZ, 0.0))
     # b starts later in the scene, and its file starts at 0.5 s.
-    assert found.delay_s == pytest.approx(late_s - 0.5, abs=0.001)
-    assert 0.3 < found.confidence <= 1
+    assert delay_s == pytest.approx(late_s - 0.5, abs=0.001)
+    assert 0.3 < confidence <= 1
 
 
 def test_sounds_that_cannot_tell_are_refused() -> None:

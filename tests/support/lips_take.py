@@ -156,6 +156,6 @@ def described(name, fps, frames, cameras, picks=None):
         lines += ["[bootstrap]", "frame = 0", ""]
     for jaw, own in zip(ROWS, picks or ((), ())):
         for pick in own:
-            views = ", ".join(f'{{ camera = "{name}", x = {x:.2f}, y = {y:.2f} }}' for name, x, y in pick.views)
+            views = ", ".join(f'{{ camera = "{v.camera}", x = {v.x:.2f}, y = {v.y:.2f} }}' for v in pick.views)
             lines += [f"[[bootstrap.{jaw}]]", f"vertex = {pick.vertex}", f"views = [{views}]", ""]
     return "\n".join(lines)

@@ -132,9 +132,9 @@ def test_picks_are_spread_tips_near_their_projections(anatomy: PersonAnatomy) ->
     assert len(picks) == 4 and np.ptp(points[:, 0]) > 25
     for pick, point in zip(picks, points, strict=True):
         assert anatomy.lower.tooth[pick.vertex] != 0 and len(pick.views) == 2
-        for name, x, y in pick.views:
-            camera = next(c for c in cameras if c.name == name)
-            miss = camera.project(transform_point(T_WORLD_SCAN @ T_jaw, point)) - [x, y]
+        for view in pick.views:
+            camera = next(c for c in cameras if c.name == view.camera)
+            miss = camera.project(transform_point(T_WORLD_SCAN @ T_jaw, point)) - [view.x, view.y]
             assert 0 < np.abs(miss).max() < 5
 
 
