@@ -263,12 +263,7 @@ def map_large_arrays() -> None:
     By default, glibc raises its threshold to the size of the largest block freed so far. The setting is process-wide;
     libraries should not call this.
     """
-    if sys.platform == "linux":
-        import ctypes
-
-        option = getattr(ctypes.CDLL(None), "mallopt", None)
-        if option is not None:
-            option(_M_MMAP_THRESHOLD, _LARGE_BYTES)
+    _call_glibc("mallopt", _M_MMAP_THRESHOLD, _LARGE_BYTES)
 
 
 def trim_memory() -> None:
@@ -276,9 +271,14 @@ def trim_memory() -> None:
 
     glibc keeps free blocks that lie below a block in use: about 100 MB after each stage of a build.
     """
+    _call_glibc("malloc_trim", 0)
+
+
+def _call_glibc(name: str, *values: int) -> None:
+    """Call a function of the C library if it has it."""
     if sys.platform == "linux":
         import ctypes
 
-        trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
-        if trim is not None:
-            trim(0)
+        function = getattr(ctypes.CDLL(None), name, None)
+        if function is not None:
+            function(*values)

@@ -23,6 +23,7 @@ from jawusd.cameras.equalizer_lens import FoundLens, Lens, find_lenses, opencv_o
 from jawusd.cameras.files import CameraFormat, Size, files_in, known_size
 from jawusd.cameras.nuke_script import SAME, NukeNode, knob_values, read_nuke_script, steady_values
 from jawusd.geometry import Camera, make_transform, se3_inverse, so3_exp
+from jawusd.geometry.camera import intrinsics
 
 _OPENGL = np.diag([1.0, -1.0, -1.0])
 
@@ -88,13 +89,8 @@ def _camera(path: Path, node: NukeNode, lenses: list[FoundLens], sizes: Mapping[
     lens = _lens_of(path, name, lenses)
     if lens is not None:
         _check_same_plate(path, name, back, offset, lens)
-    K = np.array(
-        [
-            [focal_mm * size[0] / back[0], 0.0, size[0] * (0.5 + offset[0] / back[0]) - 0.5],
-            [0.0, focal_mm * size[1] / back[1], size[1] * (0.5 - offset[1] / back[1]) - 0.5],
-            [0.0, 0.0, 1.0],
-        ]
-    )
+    cx, cy = size[0] * (0.5 + offset[0] / back[0]) - 0.5, size[1] * (0.5 - offset[1] / back[1]) - 0.5
+    K = intrinsics(focal_mm * size[0] / back[0], focal_mm * size[1] / back[1], cx, cy)
     T_cam_world = _world_to_camera(path, node)
     if lens is None:
         return Camera(name, size, K, np.zeros(0), T_cam_world)

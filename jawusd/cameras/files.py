@@ -25,7 +25,7 @@ from jawusd.base.errors import CalibrationError
 from jawusd.base.inputs import check_input
 from jawusd.base.tables import read_text
 from jawusd.geometry import Camera, make_transform, orthonormalise, rigidity_defect, se3_inverse
-from jawusd.geometry.camera import opencv_radial
+from jawusd.geometry.camera import intrinsics, opencv_radial
 
 Size = tuple[int, int]
 
@@ -202,7 +202,7 @@ def corner_matrix(path: Path, where: str, fx: float, fy: float, cx: float, cy: f
     """
     if not (fx > 0 and fy > 0):
         raise CalibrationError(f"{where} has focal lengths {fx:g} and {fy:g} px; they must be > 0 px.", path=path)
-    return np.array([[fx, 0.0, cx - 0.5], [0.0, fy, cy - 0.5], [0.0, 0.0, 1.0]])
+    return intrinsics(fx, fy, cx - 0.5, cy - 0.5)
 
 
 def cameras_of_images(path: Path, images: Sequence[tuple[str, Camera]]) -> list[Camera]:
@@ -223,18 +223,13 @@ def cameras_of_images(path: Path, images: Sequence[tuple[str, Camera]]) -> list[
         known = cameras.setdefault(name, replace(camera, name=name))
         turned = np.abs(known.T_cam_world[:3, :3] - camera.T_cam_world[:3, :3]).max()
         moved = np.linalg.norm(known.centre_world() - camera.centre_world())
-        what = ""
-        if turned > _MOVED_RAD or moved > _MOVED_SHARE * np.linalg.norm(known.centre_world()) + 1e-12:
-            what = "has different poses"
-        elif known.size_px != camera.size_px or not _same_lens(known, camera):
-            what = "has different lenses"
-        if what:
+        poses_differ = turned > _MOVED_RAD or moved > _MOVED_SHARE * np.linalg.norm(known.centre_world()) + 1e-12
+        if poses_differ or known.size_px != camera.size_px or not _same_lens(known, camera):
             raise CalibrationError(
-                f"camera {name} {what} in different images.",
+                f"camera {name} has different {'poses' if poses_differ else 'lenses'} in different images.",
                 path=path,
                 hint="Name images after their cameras, with one image (cam0.png) or one folder (cam0/0001.png) per "
-                "camera, "
-                "and use one lens for all images of a camera.",
+                "camera, and use one lens for all images of a camera.",
             )
     return [cameras[name] for name in sorted(cameras)]
 

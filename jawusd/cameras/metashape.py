@@ -30,6 +30,7 @@ from jawusd.cameras.files import (
     world_to_camera,
 )
 from jawusd.geometry import Camera
+from jawusd.geometry.camera import intrinsics
 
 _HALF_PX, _MOST_PX = 0.5, 1e6
 
@@ -101,7 +102,7 @@ def _lens(path: Path, sensor: ElementTree.Element) -> tuple[Size, Array, Array]:
     old = "fx" in values
     cx = value("cx") + (0.0 if old else size[0] / 2) - _HALF_PX
     cy = value("cy") + (0.0 if old else size[1] / 2) - _HALF_PX
-    K = np.array([[wide, value("b2"), cx], [0.0, focal, cy], [0.0, 0.0, 1.0]])
+    K = intrinsics(wide, focal, cx, cy, value("b2"))
     for key in ("p3", "p4"):  # former names of the tangential coefficients
         if value(key):
             raise CalibrationError(

@@ -35,6 +35,7 @@ from jawusd.cameras.files import (
     world_to_camera,
 )
 from jawusd.geometry import Camera, make_transform, se3_inverse, so3_exp
+from jawusd.geometry.camera import intrinsics
 
 _MOST_BYTES = 16 << 20
 _HALF_PX = 0.5
@@ -127,7 +128,7 @@ def _lens(
         raise CalibrationError(f"camera {name} has focal length {f35_mm:g} mm; it must be > 0.", path=path)
     focal = f35_mm / _FILM_MM * longer
     cx, cy = (principal[k] * longer + size[k] / 2 - _HALF_PX for k in (0, 1))
-    K = np.array([[focal, 0.0, cx], [0.0, focal, cy], [0.0, 0.0, 1.0]])
+    K = intrinsics(focal, focal, cx, cy)
     return K, lens_with_k4(path, name, K, size, terms[:4], (float(terms[4]), float(terms[5])))
 
 

@@ -19,6 +19,7 @@ from jawusd.base.arrays import Array
 from jawusd.base.errors import CalibrationError
 from jawusd.capture.initial_guess import InitialGuess
 from jawusd.geometry import hat, make_transform, so3_exp, so3_left_jacobian, so3_log
+from jawusd.geometry.camera import intrinsics
 
 _LENS = 6  # Number of lens parameters per camera: fx, fy, cx, cy, k1, k2.
 _POSE = 6  # Number of pose parameters: rotation vector [rad], translation [mm].
@@ -185,7 +186,7 @@ class _Problem:
         """
         cameras, boards = self.split(x)
         lens, pose = cameras[c * _LENS : (c + 1) * _LENS], self._pose(x, c)
-        K = np.array([[lens[0], 0, lens[2]], [0, lens[1], lens[3]], [0, 0, 1.0]])
+        K = intrinsics(*lens[:4])
         views, corners = self.points[c]
         turned = (turns[views] @ self.points_mm[corners][..., None])[..., 0]
         carried = (turned + boards[views, 3:]) @ so3_exp(pose[:3]).T

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import TypedDict
 
@@ -159,11 +159,10 @@ def _camera_figures(c: int, camera: Camera, bundle: Bundle, detections: BoardDet
 
 def _advice(
     figures: Mapping[str, CameraFigures], bundle: Bundle, points_mm: Array, centre_mm: Array, expected_mm: float
-) -> list[str]:
-    advice = []
+) -> Iterator[str]:
     fewest = min(figures, key=lambda name: figures[name]["views"])
     if figures[fewest]["views"] < _ENOUGH_VIEWS:
-        advice.append(
+        yield (
             f"camera {fewest} uses {figures[fewest]['views']} views of the board; {_ENOUGH_VIEWS} or more give a more "
             "accurate result."
         )
@@ -171,39 +170,33 @@ def _advice(
     corners += bundle.T_world_board[:, None, :3, 3]
     distance = float(np.median(np.linalg.norm(corners - centre_mm, axis=-1).min(1)))
     if distance > _FAR_MM:
-        advice.append(
+        yield (
             f"the board was held {distance:.0f} mm from the mouth (median of its nearest corner); hold it at the "
             f"position of the teeth, within {_FAR_MM:.0f} mm."
         )
     for name, figure in figures.items():
         if figure["rms_px"] > _GOOD_RMS_PX:
-            advice.append(
+            yield (
                 f"camera {name} has a reprojection error of {figure['rms_px']:.2f} px rms (a good value is "
                 f"below {_GOOD_RMS_PX:g} px): check for blur, a bent board, a zoom or a camera that moved."
             )
         if figure["coverage"] < _LITTLE_COVERAGE or figure["empty_corners"]:
             corners_left = ", ".join(figure["empty_corners"])
             unseen = f"the corners {corners_left}" if corners_left else "parts of the image"
-            advice.append(
+            yield (
                 f"camera {name}: the board covered {figure['coverage']:.0%} of the image and never reached {unseen}; "
                 "the lens model is extrapolated there, so keep the teeth out of that area."
             )
     if expected_mm > _LARGE_EXPECTED_MM:
-        advice.append(
+        yield (
             f"the expected error of distances in the mouth is {expected_mm:.3f} mm: add views, tilted up to 30 "
             "degrees, with the whole board visible in all cameras."
         )
-    return advice
 
 
-def _notes(detections: BoardDetections, bundle: Bundle, scale: ScaleCheck) -> list[str]:
-    notes = []
-    lost = int(np.isfinite(detections.corners_px[..., 0]).sum() - np.isfinite(bundle.corners_px[..., 0]).sum())
-    if lost:
-        notes.append(
-            f"{lost} of {int(np.isfinite(detections.corners_px[..., 0]).sum())} corners are outliers and were "
-            "discarded."
-        )
+def _notes(detections: BoardDetections, bundle: Bundle, scale: ScaleCheck) -> Iterator[str]:
+    found, used = (int(np.isfinite(one.corners_px[..., 0]).sum()) for one in (detections, bundle))
+    if found > used:
+        yield f"{found - used} of {found} corners are outliers and were discarded."
     if scale.ratio is None:
-        notes.append(f"the scale relies on [boards] square_mm alone: {scale.reason}.")
-    return notes
+        yield f"the scale relies on [boards] square_mm alone: {scale.reason}."

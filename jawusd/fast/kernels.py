@@ -9,6 +9,8 @@ of this file: after changing another module of this package, delete the cache (`
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -228,33 +230,23 @@ class CompiledKernels(NumpyKernels):
 
     def poses(self, d: Array) -> Array:
         """Return the poses T_skull_mandible (n, 4, 4) of d (n, 3) [mm]."""
-        out = np.empty((len(d), 4, 4))
-        poses(self._packed_model, _owned(d), out)
-        return out
+        return _filled(poses, self._packed_model, d, 4, 4)
 
     def twists(self, d: Array) -> Array:
         """Return the twists (n, 6), skull frame, of d (n, 3) [mm]."""
-        out = np.empty((len(d), 6))
-        twists(self._packed_model, _owned(d), out)
-        return out
+        return _filled(twists, self._packed_model, d, 6)
 
     def jacobians(self, d: Array) -> Array:
         """Return the derivatives (n, 6, 3) of the twists with respect to d (n, 3) [mm]."""
-        out = np.empty((len(d), 6, 3))
-        jacobians(self._packed_model, _owned(d), out)
-        return out
+        return _filled(jacobians, self._packed_model, d, 6, 3)
 
     def margins(self, d: Array) -> Array:
         """Return the signed distances (n,) [mm] from d (n, 3) [mm] to the bound, positive inside."""
-        out = np.empty(len(d))
-        margins(self._packed_bound, _owned(d), out)
-        return out
+        return _filled(margins, self._packed_bound, d)
 
     def margin_gradients(self, d: Array) -> Array:
         """Return the derivatives (n, 3) of the margins with respect to d (n, 3) [mm]."""
-        out = np.empty((len(d), 3))
-        margin_gradients(self._packed_bound, _owned(d), out)
-        return out
+        return _filled(margin_gradients, self._packed_bound, d, 3)
 
     def encode(self, T: Array) -> tuple[Array, Array]:
         """Return the d (n, 3) [mm] nearest to poses T_skull_mandible (n, 4, 4), and the residuals (n,) [mm]."""
@@ -268,6 +260,13 @@ class CompiledKernels(NumpyKernels):
         judge_rows(self._packed_model, self._packed_bound, _owned(T), True, limits.residual_mm, limits.margin_mm, out)
         reason = out[:, 5]  # `logical_not` is three times as fast as `== 0`
         return Verdicts(np.logical_not(reason), reason.astype(np.uint8), out[:, 3], out[:, 4], out[:, :3])
+
+
+def _filled(function: Callable[[Array, Array, Array], None], packed: Array, d: Array, *shape: int) -> Array:
+    """Return what a compiled function writes for each row of d (n, 3), shape (n, *shape)."""
+    out = np.empty((len(d), *shape))
+    function(packed, _owned(d), out)
+    return out
 
 
 def _owned(values: Array) -> Array:

@@ -76,9 +76,8 @@ def bite_normal(upper_vertices: ArrayLike, lower_vertices: ArrayLike) -> Array:
     overlap. Mean heights of whole arches mislead with missing, short or deeply overlapping teeth.
     """
     upper, lower = _thin(np.asarray(upper_vertices, np.float64)), _thin(np.asarray(lower_vertices, np.float64))
-    e1, e2, normal = np.linalg.svd(np.concatenate([upper - upper.mean(0), lower - lower.mean(0)]), full_matrices=False)[
-        2
-    ]
+    centred = np.concatenate([upper - upper.mean(0), lower - lower.mean(0)])
+    e1, e2, normal = np.linalg.svd(centred, full_matrices=False)[2]
     heights = []
     for points in (upper, lower):
         cells = np.floor(np.stack([points @ e1, points @ e2], 1) / _CELL_MM).astype(int)

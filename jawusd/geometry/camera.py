@@ -76,13 +76,8 @@ class Camera:
             jx = (self._distort(x + [h, 0]) - self._distort(x - [h, 0])) / (2 * h)
             jy = (self._distort(x + [0, h]) - self._distort(x - [0, h])) / (2 * h)
             det = jx[..., 0] * jy[..., 1] - jy[..., 0] * jx[..., 1]
-            step = np.stack(
-                [
-                    (f[..., 0] * jy[..., 1] - f[..., 1] * jy[..., 0]) / det,
-                    (f[..., 1] * jx[..., 0] - f[..., 0] * jx[..., 1]) / det,
-                ],
-                axis=-1,
-            )
+            x_step = (f[..., 0] * jy[..., 1] - f[..., 1] * jy[..., 0]) / det
+            step = _paired(x_step, (f[..., 1] * jx[..., 0] - f[..., 0] * jx[..., 1]) / det)
             x = x - step
             if np.all(np.abs(step) < 1e-14):
                 break
@@ -134,6 +129,11 @@ class Camera:
         dx = 2 * p1 * xy + p2 * (r2 + 2 * x0**2)
         dy = p1 * (r2 + 2 * x1**2) + 2 * p2 * xy
         return _paired(x0 * radial + dx, x1 * radial + dy)
+
+
+def intrinsics(fx: float, fy: float, cx: float, cy: float, skew: float = 0.0) -> Array:
+    """Return the intrinsic matrix K (3, 3) of focal lengths, principal point and skew [px]."""
+    return np.array([[fx, skew, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
 
 def _paired(x: Array, y: Array) -> Array:
@@ -230,4 +230,4 @@ def _through(values: Array, ideal: Array) -> Array:
 def _with_lens(values: Array) -> Camera:
     """Return a camera with fx, fy, skew, cx, cy [px] and eight distortion coefficients."""
     fx, fy, skew, cx, cy = values[:5]
-    return Camera("", (1, 1), np.array([[fx, skew, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]), values[5:13], np.eye(4))
+    return Camera("", (1, 1), intrinsics(fx, fy, cx, cy, skew), values[5:13], np.eye(4))

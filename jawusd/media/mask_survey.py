@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
@@ -49,7 +49,7 @@ def survey_masks(source: CameraSource, size_px: tuple[int, int]) -> list[Finding
     ]
     upper, lower = (reader.levels for reader in readers)
     if upper is not None and upper == lower:
-        return out + _of_levels(source, "both rows of", upper)
+        return [*out, *_of_levels(source, "both rows of", upper)]
     for arch, levels in zip(ARCHES, (upper, lower), strict=True):
         if levels is not None:
             out += _of_levels(source, f"the {arch}", levels)
@@ -66,40 +66,34 @@ def odd_pictures(source: CameraSource, arch: str, odd: Sequence[str]) -> list[Fi
     return [Finding("masks_odd", "warning", said, value=len(odd), camera=source.name, hint=hint)]
 
 
-def _of_levels(source: CameraSource, rows: str, levels: MaskLevels) -> list[Finding]:
-    out = []
+def _of_levels(source: CameraSource, rows: str, levels: MaskLevels) -> Iterator[Finding]:
     if not levels.usual:
         low, high = sorted((levels.background, levels.teeth))
         inverted = "; they are inverted, with teeth dark on light" if levels.inverted else ""
         channel = "transparency" if levels.plane == "alpha" else "masks"
         said = f"the {channel} of {rows} teeth have the values {low:g} and {high:g}: {levels.teeth:g} is taken as teeth"
-        out.append(Finding("mask_levels", "note", f"{said}{inverted}.", value=levels.teeth, camera=source.name))
+        yield Finding("mask_levels", "note", f"{said}{inverted}.", value=levels.teeth, camera=source.name)
     if levels.soft > MOST_SOFT:
-        out.append(
-            Finding(
-                "masks_soft",
-                "warning",
-                f"in the masks of {rows} teeth, {levels.soft:.0%} of the segmented pixels lie between background "
-                f"({levels.background:g}) and teeth ({levels.teeth:g}); a fraction of at most {MOST_SOFT:.0%} is "
-                "usual. The outline is placed midway.",
-                value=round(levels.soft, 3),
-                limit=MOST_SOFT,
-                camera=source.name,
-                hint="Export masks with edges a few pixels wide, not the masked footage.",
-            )
+        yield Finding(
+            "masks_soft",
+            "warning",
+            f"in the masks of {rows} teeth, {levels.soft:.0%} of the segmented pixels lie between background "
+            f"({levels.background:g}) and teeth ({levels.teeth:g}); a fraction of at most {MOST_SOFT:.0%} is "
+            "usual. The outline is placed midway.",
+            value=round(levels.soft, 3),
+            limit=MOST_SOFT,
+            camera=source.name,
+            hint="Export masks with edges a few pixels wide, not the masked footage.",
         )
     if levels.ambiguous:
-        out.append(
-            Finding(
-                "mask_polarity",
-                "warning",
-                f"the masks of {rows} teeth have the values {levels.background:g} and {levels.teeth:g}, and it is "
-                f"unclear which is the background; {levels.teeth:g} is taken as teeth.",
-                camera=source.name,
-                hint="Export the masks with teeth in white, on black up to the border of the image.",
-            )
+        yield Finding(
+            "mask_polarity",
+            "warning",
+            f"the masks of {rows} teeth have the values {levels.background:g} and {levels.teeth:g}, and it is "
+            f"unclear which is the background; {levels.teeth:g} is taken as teeth.",
+            camera=source.name,
+            hint="Export the masks with teeth in white, on black up to the border of the image.",
         )
-    return out
 
 
 @dataclass(frozen=True, eq=False)

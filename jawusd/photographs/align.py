@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -152,7 +152,7 @@ def _result(
             )
         )
     depth = contact.depth_mm(joint.T_upper_lower)
-    return AlignedPhotos(joint.T_upper_lower, joint.gum_mm, depth, tuple(photos), _findings(photos))
+    return AlignedPhotos(joint.T_upper_lower, joint.gum_mm, depth, tuple(photos), tuple(_findings(photos)))
 
 
 def _line_distances(photo: Photo, joint: Bite, rows: ArchPair) -> tuple[Array, Array]:
@@ -171,26 +171,24 @@ def _lower_incisor(rows: ArchPair) -> Array:
     return np.asarray(points[ahead[up[ahead].argmax()]], np.float64)
 
 
-def _findings(photos: Sequence[AlignedPhoto]) -> tuple[Finding, ...]:
-    """Return the findings about an alignment."""
-    out = []
+def _findings(photos: Sequence[AlignedPhoto]) -> Iterator[Finding]:
+    """Yield the findings about an alignment."""
     for photo in photos:
         finding = partial(Finding, camera=photo.name)
         if photo.misfit > _MOST_MISFIT:
             message = f"the crowns do not fit the drawn lines (misfit {photo.misfit:.2f}; at most {_MOST_MISFIT})"
             hint = "Check that the scans are recent and of this subject, and that the teeth are closed."
-            out.append(finding("photo_unfit", "error", message, photo.misfit, _MOST_MISFIT, hint=hint))
+            yield finding("photo_unfit", "error", message, photo.misfit, _MOST_MISFIT, hint=hint)
         elif photo.other_hand < _SAME_HAND:
             message = f"the photograph fits about equally well {'un' if photo.mirrored else ''}mirrored"
-            out.append(finding("photo_hand", "warning", message, photo.other_hand, _SAME_HAND))
+            yield finding("photo_hand", "warning", message, photo.other_hand, _SAME_HAND)
         if photo.alone_off_mm > _APART_MM:
             message = (
                 f"aligned alone, it places the lower incisor {photo.alone_off_mm:.1f} mm from the joint result "
                 f"(at most {_APART_MM} mm is allowed)"
             )
             hint = "A single view is inaccurate along its line of sight; photographs of different bites also disagree."
-            out.append(finding("photo_bite", "warning", message, photo.alone_off_mm, _APART_MM, hint=hint))
-    return tuple(out)
+            yield finding("photo_bite", "warning", message, photo.alone_off_mm, _APART_MM, hint=hint)
 
 
 def _rms(values: Array) -> float:

@@ -13,6 +13,7 @@ from scipy.ndimage import distance_transform_edt
 
 from jawusd.base.arrays import Array
 from jawusd.geometry import anatomical_frame, make_transform, se3_inverse, so3_exp
+from jawusd.geometry.camera import intrinsics
 from jawusd.photographs.drawing import Crowns, Drawing, draw_teeth, outlines_of, split_teeth
 from jawusd.photographs.solve import Aligner, Bite, Contact, Photo, PhotoPose, middle_of
 from jawusd.tracking.contour.scan import Scan, thinned
@@ -172,7 +173,7 @@ def _seen_spectra(
 ) -> NDArray[np.complex128]:
     """Return spectra of images that are 1 on outlines and decrease with distance from them, shape (_SECTORS, h, w)."""
     focal = _PX_PER_MM * _DISTANCE_MM
-    K = np.array([[focal, 0.0, size / 2], [0.0, focal, size / 2], [0.0, 0.0, 1.0]])
+    K = intrinsics(focal, focal, size / 2, size / 2)
     matrices = [K @ T_cam_upper[:3], K @ (T_cam_upper @ T_upper_lower)[:3]]
     depth, labels = draw_teeth(crowns, matrices, (size, size))
     seen = outlines_of(crowns, matrices, depth, labels)

@@ -14,6 +14,7 @@ from scipy.spatial import cKDTree
 
 from jawusd.base.arrays import Array
 from jawusd.geometry import orthonormalise, so3_log, transform_point, transform_points
+from jawusd.geometry.camera import intrinsics
 from jawusd.photographs.drawing import Crowns, Drawing, Outlines, draw_teeth, features, outlines_of
 from jawusd.tracking.contour.equations import motion_about
 from jawusd.tracking.contour.scan import Scan
@@ -64,8 +65,7 @@ class PhotoPose:
 
     def camera_matrix(self, size_px: tuple[int, int]) -> Array:
         """Return the undistorted projection from camera [mm] to homogeneous px, shape (3, 3)."""
-        u, v = middle_of(size_px)
-        return np.array([[self.focal_px, 0.0, u], [0.0, self.focal_px, v], [0.0, 0.0, 1.0]])
+        return intrinsics(self.focal_px, self.focal_px, *middle_of(size_px))
 
     def pixels(self, points: Array, size_px: tuple[int, int]) -> Array:
         """Project points in camera coordinates (N, 3) [mm] to the image [px], shape (N, 2)."""

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from jawusd.base.arrays import Array, Mask
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry import Camera, make_transform, se3_inverse, so3_exp, transform_points
+from jawusd.geometry.camera import intrinsics
 from jawusd.meshes.surfaces import grid_faces
 from jawusd.synthetic.anatomy import Face, LipState, Occlusion, PersonAnatomy, Surface, opened_bite, palate, tongue
 from jawusd.synthetic.dental_arch import DentalArch
@@ -65,13 +66,7 @@ def build_cameras(size_px: tuple[int, int]) -> list[Camera]:
         if k:
             T_world_cam = make_transform(turn, target - turn @ [0.0, 0.0, 206.0 + 3.0 * k])
         focal = _FOCAL * width * zoom
-        K = np.array(
-            [
-                [focal, 0.0, width / 2 - 0.5 + shift[0] * width],
-                [0.0, focal, height / 2 - 0.5 + shift[1] * width],
-                [0.0, 0.0, 1.0],
-            ]
-        )
+        K = intrinsics(focal, focal, width / 2 - 0.5 + shift[0] * width, height / 2 - 0.5 + shift[1] * width)
         cameras.append(Camera(f"cam{k}", size_px, K, np.array(distortion), se3_inverse(T_world_cam)))
     return cameras
 
