@@ -152,7 +152,6 @@ class SkinFollower:
     """Follows points from image to image, away from the key frame."""
 
     def __init__(self, tracker: SkinTracker, views: Sequence[SkinView], key: Sequence[Gray], names: list[str]) -> None:
-        """Start at the key frame."""
         self._tracker, self._views, self._key, self._names = tracker, views, key, names
         self._last = list(key)
         self._at = [pixels.copy() for pixels in tracker.pixels]

@@ -146,7 +146,6 @@ class FrameReader:
     """
 
     def __init__(self, video: Clip) -> None:
-        """Prepare to read images from a clip."""
         self.video = video
         width, height = video.size_px
         self._most = max(2, min(64, _KEPT_BYTES // (3 * width * height)))

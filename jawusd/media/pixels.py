@@ -119,8 +119,6 @@ Colour = Literal["gray", "rgb", "rgba"]
 #: Row slice and column slice of an image region.
 Slices: TypeAlias = "tuple[slice[int, int, int], slice[int, int, int]]"
 
-# Gray value of each luma value in the video range of ITU-R BT.709 and BT.601, where 16 is black and 235 is white.
-_STRETCH = np.clip(np.round((np.arange(256) - 16.0) * 255 / 219), 0, 255).astype(np.uint8)
 _BYTE_BITS = 8
 # Flags of FFmpeg's conversion to RGB that enable rounding and chroma interpolation; without rounding, images are 1.3 of
 # 255 levels too dark.
@@ -184,7 +182,6 @@ class DecodedPicture:
     """Decoded image (height, width, 3), accessed like an array; only accessed regions are converted to RGB."""
 
     def __init__(self, frame: av.VideoFrame, rotation_deg: int) -> None:
-        """Store a decoded image and the rotation that the file states."""
         self._frame, self._rotation_deg = frame, rotation_deg
         turned = rotation_deg in (90, 270)
         self.shape = (frame.width, frame.height, 3) if turned else (frame.height, frame.width, 3)
@@ -289,7 +286,7 @@ def _gray(frame: av.VideoFrame, rotation_deg: int) -> NDArray[np.uint8]:
         frame = frame.reformat(format="gray")
     image = np.rot90(_plane(frame.planes[0]), rotation_deg // 90)
     if name in _PLANAR_VIDEO_RANGE and not full:
-        return np.asarray(cv2.LUT(np.ascontiguousarray(image), _STRETCH), np.uint8)
+        return np.asarray(cv2.LUT(np.ascontiguousarray(image), _deep_table(8, False, False)[:256]), np.uint8)
     return image
 
 

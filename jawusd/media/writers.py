@@ -101,7 +101,6 @@ class PlateWriter:
     """
 
     def __init__(self, camera: Camera) -> None:
-        """Prepare the undistortion of a camera."""
         self._view = WorkingView(camera, camera.size_px)
 
     def write(self, path: str | os.PathLike[str], image: NDArray[np.uint8]) -> None:

@@ -196,7 +196,6 @@ class ContactMap:
     """Images of a subject's tooth contacts in any pose, like marks of articulating paper."""
 
     def __init__(self, teeth: Teeth) -> None:
-        """Prepare the height maps of both arches."""
         self._teeth = teeth
         self._arches = _arch(teeth.pair.upper, 1.0), _arch(teeth.pair.lower, -1.0)
 

@@ -110,7 +110,6 @@ class Contact:
     """Contact prior: closed teeth touch on the left and on the right."""
 
     def __init__(self, scans: Sequence[Scan]) -> None:
-        """Prepare the surfaces of the upper and the lower crowns."""
         self._upper, self._lower = (crown_surface(scan) for scan in scans)
         self._tree = cKDTree(self._upper.points)
         centred = self._lower.points - scans[1].centre

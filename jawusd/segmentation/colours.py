@@ -208,7 +208,6 @@ class ColourStates:
     """Files that hold the colour models of all cameras."""
 
     def __init__(self, folder: Path, colours: Mapping[str, ColourModel]) -> None:
-        """Store the folder of the files, and the colours by camera."""
         self._folder, self._colours = folder, dict(colours)
 
     def save(self, frame: int, step: int) -> None:

@@ -52,7 +52,6 @@ class ArchLine:
     """Planar curve through the contact points; its parameter is the arc length from the midline, positive left."""
 
     def __init__(self, shape: ArchShape) -> None:
-        """Compute the curve for the shape of an arch."""
         x = np.linspace(-40.0, 40.0, 8001)
         z = -shape.quadratic_per_mm * x**2 - shape.quartic_per_mm3 * x**4
         slope = -2 * shape.quadratic_per_mm * x - 4 * shape.quartic_per_mm3 * x**3
