@@ -25,17 +25,11 @@ _GROWTH = ("base_mm", "per_mm")  # names of the coefficients of a landmark's err
 
 
 class HeldOut(NamedTuple):
-    """Distances by which frames of a take lie outside a bound that was built without them.
+    """Distances by which frames of a take lie outside a bound that was built without them."""
 
-    Attributes:
-        share: Fraction of these frames within the tolerance.
-        p95_mm: 95th percentile of the distance of these frames outside the bound; frames inside count as 0.
-        tolerance_mm: The tolerance of the rig.
-    """
-
-    share: float
-    p95_mm: float
-    tolerance_mm: float
+    share: float  # fraction of these frames within the tolerance
+    p95_mm: float  # 95th percentile of the distance of these frames outside the bound; frames inside count as 0
+    tolerance_mm: float  # the tolerance of the rig
 
     @property
     def words(self) -> str:

@@ -104,13 +104,9 @@ def monotone_tangents(frames: Array, keys: Array) -> Array:
 
 
 class RigAuthoring(RigArrays):
-    """Authoring functions of a rig: motions of d, and ranges within the bound.
+    """Authoring functions of a rig: motions of d, and ranges within the bound."""
 
-    Attributes:
-        bound: The slice bound.
-    """
-
-    bound: SliceHull
+    bound: SliceHull  # the slice bound
 
     def interpolate(
         self,

@@ -33,28 +33,18 @@ _CANDIDATE_RADII = (0.4, 0.75, 0.9, 0.97, 1.0)
 
 @dataclass(frozen=True, eq=False)
 class SliceHull:
-    """The slice hull of a rig.
+    """The slice hull of a rig."""
 
-    Attributes:
-        supports: h_k(d1) [mm], constant outside the captured openings.
-        directions: Unit normals n_k in (d2, d3) around the full circle, shape (K, 2).
-        softness_mm: Radius of the rounded edges between half-spaces.
-        offset_mm: Distance by which the bound extends beyond its supports.
-        slopes: Derivatives of v_k, v_low and v_high with respect to d, shape (K + 2, 3), without the d1 derivatives of
-            v_k, which depend on d1 and are 0 here.
-        formula: The same bound for one d, evaluated in Python floats.
-        first_mm: Smallest captured opening.
-        last_mm: Largest captured opening.
-    """
-
-    supports: HermiteCurve
-    directions: Array
-    softness_mm: float
-    offset_mm: float
-    formula: BoundFormula
+    supports: HermiteCurve  # h_k(d1) [mm], constant outside the captured openings
+    directions: Array  # unit normals n_k in (d2, d3) around the full circle, shape (K, 2)
+    softness_mm: float  # radius of the rounded edges between half-spaces
+    offset_mm: float  # distance by which the bound extends beyond its supports
+    formula: BoundFormula  # the same bound for one d, evaluated in Python floats
+    #: derivatives of v_k, v_low and v_high with respect to d, shape (K + 2, 3), without the d1 derivatives of v_k,
+    #: which depend on d1 and are 0 here
     slopes: Array = field(init=False, repr=False)
-    first_mm: float = field(init=False, repr=False)
-    last_mm: float = field(init=False, repr=False)
+    first_mm: float = field(init=False, repr=False)  # smallest captured opening
+    last_mm: float = field(init=False, repr=False)  # largest captured opening
 
     def __post_init__(self) -> None:
         # the K rows of v_k (their d1 column, -h_k', is added during evaluation), then v_low and v_high
@@ -256,15 +246,10 @@ def _scale(bound: SliceHull, d_range: Array, d1: Array, sides: Array) -> Array:
 
 @dataclass(frozen=True)
 class PolygonBound:
-    """The bound of the paper: two alpha shapes.
+    """The bound of the paper: two alpha shapes."""
 
-    Attributes:
-        opening_lateral: Edges of the outlines in (d1, d2) [mm], each as its start and end point, shape (e, 2, 2).
-        opening_protrusion: Edges of the outlines in (d1, d3) [mm], likewise, shape (f, 2, 2).
-    """
-
-    opening_lateral: Array
-    opening_protrusion: Array
+    opening_lateral: Array  # edges of the outlines in (d1, d2) [mm], each as its start and end point, shape (e, 2, 2)
+    opening_protrusion: Array  # edges of the outlines in (d1, d3) [mm], likewise, shape (f, 2, 2)
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, Array]) -> PolygonBound:

@@ -36,18 +36,13 @@ _TIGHT_SHARES = (1.0, 0.5, 0.25, 0.1)
 
 
 class Inside(NamedTuple):
-    """A motion inside the bound.
+    """A motion inside the bound."""
 
-    Attributes:
-        times: Sample times, shape (n,): the original ones, and more where straight lines between the original
-            samples would leave the bound.
-        d: Jaw parameters at these times [mm], linear in between, shape (n, 3).
-        given: Mask of the original samples, shape (n,).
-    """
-
+    #: sample times, shape (n,): the original ones, and more where straight lines between the original samples would
+    #: leave the bound
     times: Array
-    d: Array
-    given: Mask
+    d: Array  # jaw parameters at these times [mm], linear in between, shape (n, 3)
+    given: Mask  # mask of the original samples, shape (n,)
 
 
 def kept_inside(bound: SliceHull, times: Array, d: Array, *, ends_stay: bool = False) -> Inside:

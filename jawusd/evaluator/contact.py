@@ -34,35 +34,23 @@ PREFIXES: dict[Meeting, str] = {"teeth": "contact", "condyles": "joint"}
 
 
 class Clearance(NamedTuple):
-    """Result of `JawRig.clearance`.
+    """Result of `JawRig.clearance`."""
 
-    Attributes:
-        clearance_mm: Negative where surfaces penetrate deeper than in the closed bite, shape (...).
-        gradient: Its derivative with respect to d [mm/mm], shape (..., 3).
-    """
-
-    clearance_mm: Array
-    gradient: Array
+    clearance_mm: Array  # negative where surfaces penetrate deeper than in the closed bite, shape (...)
+    gradient: Array  # its derivative with respect to d [mm/mm], shape (..., 3)
 
 
 @dataclass(frozen=True, eq=False)
 class ContactField:
-    """The clearance of a rig, sampled over d.
+    """The clearance of a rig, sampled over d."""
 
-    Attributes:
-        first_mm: d of the first sample, shape (3,).
-        step_mm: Sample spacing along each axis, shape (3,).
-        values: Clearances [mm], shape (n1, n2, n3).
-        closed_mm: Penetration depth of the scans in the closed bite; negative for a gap.
-        error_mm: Largest interpolation error at random valid parameters with a clearance below `NEAR_MM`; at least 0.
-        limit_mm: Smallest clearance of the captured poses, at most 0; measured poses with a smaller clearance collide.
-    """
-
-    first_mm: Array
-    step_mm: Array
-    values: Array
-    closed_mm: float
+    first_mm: Array  # d of the first sample, shape (3,)
+    step_mm: Array  # sample spacing along each axis, shape (3,)
+    values: Array  # clearances [mm], shape (n1, n2, n3)
+    closed_mm: float  # penetration depth of the scans in the closed bite; negative for a gap
+    #: largest interpolation error at random valid parameters with a clearance below `NEAR_MM`; at least 0
     error_mm: float
+    #: smallest clearance of the captured poses, at most 0; measured poses with a smaller clearance collide
     limit_mm: float
     _floats: tuple[Callable[[int], float], list[float], list[float], list[int]] = field(init=False, repr=False)
 
@@ -163,15 +151,11 @@ _CORNERS = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), axis=-1)
 
 
 class RigClearance:
-    """The clearances of a rig.
+    """The clearances of a rig."""
 
-    Attributes:
-        contact: Clearance of the teeth over d; None if the rig was built without it.
-        joints: Clearance of the condyles; None unless the bones of both jaws were scanned. Cartilage and disc are not
-            in the scans, so this clearance never rejects a pose.
-    """
-
-    contact: ContactField | None
+    contact: ContactField | None  # clearance of the teeth over d; None if the rig was built without it
+    #: clearance of the condyles; None unless the bones of both jaws were scanned. Cartilage and disc are not in the
+    #: scans, so this clearance never rejects a pose
     joints: ContactField | None
 
     def clearance(self, d: ArrayLike, *, of: Meeting = "teeth") -> Clearance:

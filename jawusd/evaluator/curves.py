@@ -18,20 +18,14 @@ from jawusd.evaluator.curve_formula import catmull_rom, cubic
 
 @dataclass(frozen=True)
 class HermiteCurve:
-    """A C1 cubic Hermite curve of one variable, continued as a straight line outside its knots.
+    """A C1 cubic Hermite curve of one variable, continued as a straight line outside its knots."""
 
-    Attributes:
-        knots: Increasing parameter values, shape (n,), n >= 2.
-        values: Points of the curve at the knots, shape (n, k).
-        slopes: Derivatives at the knots, shape (n, k).
-        starts: Origin of the polynomial of each interval, the straight ends first and last, shape (n + 1,).
-        coefficients: Coefficients of the powers 0..3 of (x - start) per interval, shape (n + 1, 4, k).
-    """
-
-    knots: Array
-    values: Array
-    slopes: Array
+    knots: Array  # increasing parameter values, shape (n,), n >= 2
+    values: Array  # points of the curve at the knots, shape (n, k)
+    slopes: Array  # derivatives at the knots, shape (n, k)
+    #: origin of the polynomial of each interval, the straight ends first and last, shape (n + 1,)
     starts: Array = field(init=False, repr=False)
+    #: coefficients of the powers 0..3 of (x - start) per interval, shape (n + 1, 4, k)
     coefficients: Array = field(init=False, repr=False)
 
     def __post_init__(self) -> None:

@@ -46,16 +46,12 @@ def landmark_vectors(landmarks: Array) -> Array:
 
 
 class Handles(NamedTuple):
-    """Points of the mandible that inverse kinematics moves to targets.
+    """Points of the mandible that inverse kinematics moves to targets."""
 
-    Attributes:
-        vectors: Homogeneous points of the mandible at rest, anatomical frame [mm], scaled by their weights, shape
-            (4, m).
-        sight: Unit vectors along which distances to the targets do not count, anatomical frame, shape (3, m); 0 for
-            points whose whole distance counts; None if all are such points.
-    """
-
+    #: homogeneous points of the mandible at rest, anatomical frame [mm], scaled by their weights, shape (4, m)
     vectors: Array
+    #: unit vectors along which distances to the targets do not count, anatomical frame, shape (3, m); 0 for points
+    #: whose whole distance counts; None if all are such points
     sight: Array | None = None
 
     @classmethod
@@ -154,17 +150,11 @@ class Encoding(NamedTuple):
 
 
 class WeightedEncoding(NamedTuple):
-    """Result of `JawRig.encode` with a covariance.
+    """Result of `JawRig.encode` with a covariance."""
 
-    Attributes:
-        d: The most likely jaw parameters [mm], shape (..., 3).
-        residual_mm: RMS landmark distance of their pose, shape (...).
-        covariance: Covariance of d [mm^2], shape (..., 3, 3), from the noise of the pose and, if known, the error of
-            the rig.
-    """
-
-    d: Array
-    residual_mm: Array
+    d: Array  # the most likely jaw parameters [mm], shape (..., 3)
+    residual_mm: Array  # RMS landmark distance of their pose, shape (...)
+    #: covariance of d [mm^2], shape (..., 3, 3), from the noise of the pose and, if known, the error of the rig
     covariance: Array
 
 

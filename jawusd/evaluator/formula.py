@@ -45,31 +45,18 @@ Numbers = tuple[object, ...]  # nested tuples of floats, or of their counterpart
 
 
 class GaugeNumbers(NamedTuple):
-    """The scalars of a gauge.
+    """The scalars of a gauge."""
 
-    Attributes:
-        path_x: Coefficients of gx: ``sum_k c_k (d1 / path_scale_mm)^k, k = 1..5`` [mm].
-        path_z: Coefficients of gz, likewise.
-        path_scale_mm: Length that scales the argument of the polynomials to order one.
-        low_mm: Smallest d1 of the polynomials, which continue as straight lines outside their limits.
-        high_mm: Largest d1 of the polynomials.
-        arch: The 7 coefficients of rho.
-        drop: The 4 coefficients of drop.
-        softness_mm: Radius of the softened absolute value and ramp.
-        fade_mm: Opening over which the glide surface fades out.
-        glide: Table of the glide surface, as `gauge.Elementary.glide` expects it; None without one.
-    """
-
-    path_x: Sequence[float]
-    path_z: Sequence[float]
-    path_scale_mm: float
-    low_mm: float
-    high_mm: float
-    arch: Sequence[float]
-    drop: Sequence[float]
-    softness_mm: float
-    fade_mm: float
-    glide: object = None
+    path_x: Sequence[float]  # coefficients of gx: ``sum_k c_k (d1 / path_scale_mm)^k, k = 1..5`` [mm]
+    path_z: Sequence[float]  # coefficients of gz, likewise
+    path_scale_mm: float  # length that scales the argument of the polynomials to order one
+    low_mm: float  # smallest d1 of the polynomials, which continue as straight lines outside their limits
+    high_mm: float  # largest d1 of the polynomials
+    arch: Sequence[float]  # the 7 coefficients of rho
+    drop: Sequence[float]  # the 4 coefficients of drop
+    softness_mm: float  # radius of the softened absolute value and ramp
+    fade_mm: float  # opening over which the glide surface fades out
+    glide: object = None  # table of the glide surface, as `gauge.Elementary.glide` expects it; None without one
 
 
 def long_angle_series() -> list[list[float]]:
@@ -158,17 +145,11 @@ def spline_input(gauge: GaugeNumbers, scales: Sequence[float], u: Triple[N], ops
 
 @dataclass(frozen=True)
 class RigidMotion(Generic[N]):
-    """A rigid motion.
+    """A rigid motion."""
 
-    Attributes:
-        omega: Rotation vector [rad].
-        turn: Rows of the rotation matrix minus the identity.
-        t: Translation [mm].
-    """
-
-    omega: Triple[N]
-    turn: tuple[Triple[N], Triple[N], Triple[N]]
-    t: Triple[N]
+    omega: Triple[N]  # rotation vector [rad]
+    turn: tuple[Triple[N], Triple[N], Triple[N]]  # rows of the rotation matrix minus the identity
+    t: Triple[N]  # translation [mm]
 
     def carry(self, p: Triple[N]) -> Triple[N]:
         """Return the point [mm] to which the motion moves a point [mm]."""

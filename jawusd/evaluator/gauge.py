@@ -199,30 +199,20 @@ def gradient_by_u(by_q: Triple[N], scales: Sequence[float], slopes: tuple[N, N])
 
 @dataclass(frozen=True)
 class Gauge:
-    """The map between d and the incisal displacement u; ``u(0) = 0``.
+    """The map between d and the incisal displacement u; ``u(0) = 0``."""
 
-    Attributes:
-        path_coefficients: Coefficients of gx and gz: ``sum_k c_k (d1 / path_scale_mm)^k, k = 1..5`` [mm], shape (2, 5).
-        path_scale_mm: Length that scales the argument of the polynomials to order one.
-        path_limits: d1 interval [mm] of the polynomials; outside they continue as straight lines (C1), and ``rho`` uses
-            d1 softly clamped to the interval.
-        glide_arch: Coefficients of rho, shape (7,).
-        glide_drop: Coefficients of drop, shape (4,).
-        glide_softness_mm: Radius ``e`` of the softened absolute value and ramp.
-        glide_fade_mm: Opening over which the glide surface fades out.
-        glide: Table added to drop; None without one.
-        numbers: All of the above as floats.
-    """
-
+    #: coefficients of gx and gz: ``sum_k c_k (d1 / path_scale_mm)^k, k = 1..5`` [mm], shape (2, 5)
     path_coefficients: Array
-    path_scale_mm: float
+    path_scale_mm: float  # length that scales the argument of the polynomials to order one
+    #: d1 interval [mm] of the polynomials; outside they continue as straight lines (C1), and ``rho`` uses d1 softly
+    #: clamped to the interval
     path_limits: tuple[float, float]
-    glide_arch: Array
-    glide_drop: Array
-    glide_softness_mm: float
-    glide_fade_mm: float
-    glide: GlideTable | None = None
-    numbers: GaugeNumbers = field(init=False, repr=False)
+    glide_arch: Array  # coefficients of rho, shape (7,)
+    glide_drop: Array  # coefficients of drop, shape (4,)
+    glide_softness_mm: float  # radius ``e`` of the softened absolute value and ramp
+    glide_fade_mm: float  # opening over which the glide surface fades out
+    glide: GlideTable | None = None  # table added to drop; None without one
+    numbers: GaugeNumbers = field(init=False, repr=False)  # all of the above as floats
 
     def __post_init__(self) -> None:
         path_x, path_z = self.path_coefficients.tolist()

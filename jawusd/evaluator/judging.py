@@ -30,17 +30,11 @@ def _scalar_or_array(values: Array) -> Array:
 
 
 class RigJudging(RigClearance, RigArrays):
-    """Margins and verdicts of a rig.
+    """Margins and verdicts of a rig."""
 
-    Attributes:
-        kernels: The implementation that evaluates rows.
-        limits: The rig's thresholds of `validate`, for measured poses.
-        polygons: The paper's bound.
-    """
-
-    kernels: NumpyKernels
-    limits: Limits
-    polygons: PolygonBound
+    kernels: NumpyKernels  # the implementation that evaluates rows
+    limits: Limits  # the rig's thresholds of `validate`, for measured poses
+    polygons: PolygonBound  # the paper's bound
 
     def margin(self, d: ArrayLike, *, bound: BoundName = "slices") -> Array:
         """Return the signed distance of d to the bound [mm]: positive inside, finite and smooth outside.
@@ -176,17 +170,11 @@ class RigJudging(RigClearance, RigArrays):
 
 
 class GoodPose(NamedTuple):
-    """A valid pose of a stream.
+    """A valid pose of a stream."""
 
-    Attributes:
-        time_s: Its time [s].
-        T_skull_mandible: Pose of the mandible, shape (4, 4).
-        d: Its jaw parameters [mm], shape (3,).
-    """
-
-    time_s: float
-    T_skull_mandible: Array
-    d: Array
+    time_s: float  # its time [s]
+    T_skull_mandible: Array  # pose of the mandible, shape (4, 4)
+    d: Array  # its jaw parameters [mm], shape (3,)
 
 
 class VerdictStream:

@@ -26,19 +26,12 @@ _FEW_ROWS = 3  # maximum number of rows that are searched one by one in floats, 
 
 @dataclass(frozen=True)
 class RigParts:
-    """The parts of a rig from which kernels are built.
+    """The parts of a rig from which kernels are built."""
 
-    Attributes:
-        model: The jaw model.
-        bound: The bound.
-        frames: The coordinate frames of the rig.
-        landmarks: Landmarks of the mandible [mm], mandible frame, shape (n, 3).
-    """
-
-    model: JawModelForm
-    bound: SliceHull
-    frames: RigFrames
-    landmarks: Array
+    model: JawModelForm  # the jaw model
+    bound: SliceHull  # the bound
+    frames: RigFrames  # the coordinate frames of the rig
+    landmarks: Array  # landmarks of the mandible [mm], mandible frame, shape (n, 3)
 
     def vectors(self) -> Array:
         """Return the homogeneous vectors (4, 4) that represent the landmarks, anatomical frame [mm]."""

@@ -26,18 +26,13 @@ from jawusd.geometry.rodrigues import N, Triple
 
 
 class ArraySpec(NamedTuple):
-    """Shape and USD attribute of one array.
+    """Shape and USD attribute of one array."""
 
-    Attributes:
-        attribute: USD attribute, with the values in row-major order; None for `d_range` (see `D_RANGE_ATTRIBUTES`).
-        shape: Axis lengths; axes of the same name have the same length.
-        integer: Whether the values are integers in USD; in memory all arrays are float64.
-        values: Constraint on the values: "positive", "rising" (two or more, strictly increasing), or None.
-    """
-
+    #: USD attribute, with the values in row-major order; None for `d_range` (see `D_RANGE_ATTRIBUTES`)
     attribute: str | None
-    shape: tuple[int | str, ...] = ()
-    integer: bool = False
+    shape: tuple[int | str, ...] = ()  # axis lengths; axes of the same name have the same length
+    integer: bool = False  # whether the values are integers in USD; in memory all arrays are float64
+    #: constraint on the values: "positive", "rising" (two or more, strictly increasing), or None
     values: Literal["positive", "rising"] | None = None
 
 
@@ -110,17 +105,11 @@ ANCHORED, ADDITIVE = "anchored", "additive"
 
 
 class JawFormula(Protocol):
-    """The motion of one kind of model.
+    """The motion of one kind of model."""
 
-    Attributes:
-        arrays: The arrays that a rig of this kind has besides `COMMON`, by name.
-        optional: Its optional groups of arrays besides `COMMON_OPTIONAL`.
-        tables: The rows of floats the formula needs; each number type stores them in its own form.
-    """
-
-    arrays: ClassVar[dict[str, ArraySpec]]
-    optional: ClassVar[dict[str, dict[str, ArraySpec]]]
-    tables: dict[str, Rows]
+    arrays: ClassVar[dict[str, ArraySpec]]  # the arrays that a rig of this kind has besides `COMMON`, by name
+    optional: ClassVar[dict[str, dict[str, ArraySpec]]]  # its optional groups of arrays besides `COMMON_OPTIONAL`
+    tables: dict[str, Rows]  # the rows of floats the formula needs; each number type stores them in its own form
 
     def __init__(self, arrays: Arrays) -> None: ...
 

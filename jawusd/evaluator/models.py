@@ -40,16 +40,11 @@ from jawusd.geometry.so3 import so3_left_jacobian, so3_left_jacobian_inverse
 
 
 class JawModelForm(ABC):
-    """A jaw model. By default its chart is d, and everything follows from log M(d); a kind may override any of it.
-
-    Attributes:
-        incisor: The lower incisal point at rest [mm], shape (3,).
-        d_range: Box of d [mm] over which searches start, shape (3, 2).
-    """
+    """A jaw model. By default its chart is d, and everything follows from log M(d); a kind may override any of it."""
 
     kind: ClassVar[str]
-    incisor: Array
-    d_range: Array
+    incisor: Array  # the lower incisal point at rest [mm], shape (3,)
+    d_range: Array  # box of d [mm] over which searches start, shape (3, 2)
 
     @abstractmethod
     def arrays(self) -> dict[str, Array]:
@@ -115,30 +110,21 @@ class AnchoredModel(JawModelForm):
 
     f is a polyharmonic r^3 spline with a linear tail (Duchon 1977) in the displacement u of the incisal point p,
     sheared by the habitual opening path so that its first axis runs along opening; ``f(0) = 0``.
-
-    Attributes:
-        gauge: Map between d and u.
-        incisor: The incisal point p at rest [mm], shape (3,).
-        scales: Lengths dividing the sheared displacement [mm], shape (3,).
-        centres: Spline centres, sheared and scaled, shape (m, 3).
-        weights: Weights of the m kernels and the 3 linear terms [rad], shape (m + 3, 3).
-        centres_squared: |c_i|^2, shape (m,).
-        moments: Kernel weights times 1, c_i and |c_i|^2, shape (m, 15); see `_spline`.
-        offset: Value of the spline itself at u = 0 [rad], subtracted so that f(0) = 0, shape (3,).
-        single: The model for one row, in floats.
     """
 
     kind: ClassVar[str] = ANCHORED
-    gauge: Gauge
-    incisor: Array
-    scales: Array
-    centres: Array
-    weights: Array
-    centres_squared: Array = field(init=False, repr=False)
+    gauge: Gauge  # map between d and u
+    incisor: Array  # the incisal point p at rest [mm], shape (3,)
+    scales: Array  # lengths dividing the sheared displacement [mm], shape (3,)
+    centres: Array  # spline centres, sheared and scaled, shape (m, 3)
+    weights: Array  # weights of the m kernels and the 3 linear terms [rad], shape (m + 3, 3)
+    centres_squared: Array = field(init=False, repr=False)  # |c_i|^2, shape (m,)
+    #: kernel weights times 1, c_i and |c_i|^2, shape (m, 15); see `_spline`
     moments: Array = field(init=False, repr=False)
+    #: value of the spline itself at u = 0 [rad], subtracted so that f(0) = 0, shape (3,)
     offset: Array = field(init=False, repr=False)
     _scales: tuple[float, float, float] = field(init=False, repr=False)
-    single: SingleAnchored = field(init=False, repr=False)
+    single: SingleAnchored = field(init=False, repr=False)  # the model for one row, in floats
 
     def __post_init__(self) -> None:
         # sum_i W_i r_i^3 and its gradient need only sums of r_i times W_i, W_i c_i and W_i |c_i|^2 (see _spline):
@@ -266,17 +252,13 @@ class AdditiveModel(JawModelForm):
     """A sum of three curves in se(3): ``log M(d) = Phi1(d1) + Phi2(d2) + Phi3(d3)`` (Yang et al. 2019, eq. 5).
 
     The sum is zero at d = 0: the constant that the curves have in common is included only once.
-
-    Attributes:
-        curves: The three curves of twists, about the origin of the anatomical frame.
-        incisor: The incisal point at rest [mm], shape (3,).
-        d_range: Box of valid d [mm], shape (3, 2).
     """
 
     kind: ClassVar[str] = ADDITIVE
+    #: the three curves of twists, about the origin of the anatomical frame
     curves: tuple[HermiteCurve, HermiteCurve, HermiteCurve]
-    incisor: Array
-    d_range: Array
+    incisor: Array  # the incisal point at rest [mm], shape (3,)
+    d_range: Array  # box of valid d [mm], shape (3, 2)
 
     _singles: list[SingleCurve] = field(init=False, repr=False)
 
@@ -321,15 +303,10 @@ class AdditiveModel(JawModelForm):
 
 @dataclass(frozen=True)
 class StartGrid:
-    """A grid of starting points for searches in models without a closed-form inverse.
+    """A grid of starting points for searches in models without a closed-form inverse."""
 
-    Attributes:
-        d: Jaw parameters [mm], shape (s, 3).
-        displacements: Displacements of the incisal point there [mm], shape (s, 3).
-    """
-
-    d: Array
-    displacements: Array
+    d: Array  # jaw parameters [mm], shape (s, 3)
+    displacements: Array  # displacements of the incisal point there [mm], shape (s, 3)
 
     @classmethod
     def of(cls, decode: Callable[[Array], tuple[Array, Array]], incisor: Array, d_range: Array) -> StartGrid:

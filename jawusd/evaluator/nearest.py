@@ -43,35 +43,21 @@ _FLOATS = FloatOperations()
 
 
 class Pull(NamedTuple):
-    """A squared residual and its quadratic model.
+    """A squared residual and its quadratic model."""
 
-    Attributes:
-        cost: The squared residual.
-        force: Half the negative gradient of the cost.
-        stiffness: J^T J, with J the Jacobian of the residual.
-        scale: A third of the trace of J^T J; damping is relative to it.
-    """
-
-    cost: float
-    force: Vector
-    stiffness: Symmetric
-    scale: float
+    cost: float  # the squared residual
+    force: Vector  # half the negative gradient of the cost
+    stiffness: Symmetric  # J^T J, with J the Jacobian of the residual
+    scale: float  # a third of the trace of J^T J; damping is relative to it
 
 
 class Place(NamedTuple):
-    """The bound to second order at a point: signed distance [mm], its gradient, and its Hessian [1/mm] in two parts.
+    """The bound to second order at a point: signed distance [mm], its gradient, and its Hessian [1/mm] in two parts."""
 
-    Attributes:
-        distance: Signed distance [mm], negative inside.
-        gradient: Its derivative.
-        rounding: The part of the Hessian that comes from the rounding, positive semidefinite.
-        bend: The curvature of the supports along d1, to be subtracted from the Hessian's first entry.
-    """
-
-    distance: float
-    gradient: Vector
-    rounding: Symmetric
-    bend: float
+    distance: float  # signed distance [mm], negative inside
+    gradient: Vector  # its derivative
+    rounding: Symmetric  # the part of the Hessian that comes from the rounding, positive semidefinite
+    bend: float  # the curvature of the supports along d1, to be subtracted from the Hessian's first entry
 
 
 def place(bound: BoundFormula, d: Vector) -> Place:

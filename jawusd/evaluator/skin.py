@@ -55,16 +55,11 @@ _LARGEST = 1e12  # maximum magnitude of the values in a file
 
 
 class SkinJaw(NamedTuple):
-    """Jaw parameters of faces, from `Skin`.
+    """Jaw parameters of faces, from `Skin`."""
 
-    Attributes:
-        d: Jaw parameters [mm], shape (..., 3), not projected to the rig's bound; NaN where a column is not finite.
-        covariance: Covariance of d [mm^2], shape (..., 3, 3); it grows with the distance from the training frames.
-        familiar: Whether the face resembles the training frames, shape (...); if not, the covariance is a rough guess.
-    """
-
-    d: Array
-    covariance: Array
+    d: Array  # jaw parameters [mm], shape (..., 3), not projected to the rig's bound; NaN where a column is not finite
+    covariance: Array  # covariance of d [mm^2], shape (..., 3, 3); it grows with the distance from the training frames
+    #: whether the face resembles the training frames, shape (...); if not, the covariance is a rough guess
     familiar: Mask
 
 

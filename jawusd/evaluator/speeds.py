@@ -22,15 +22,10 @@ _MIN_SPREAD = 1e-6  # Minimum relative variance in any direction; keeps covarian
 
 @dataclass(frozen=True, eq=False)
 class Speeds:
-    """Covariances of the motion of a jaw, about a mean of zero.
+    """Covariances of the motion of a jaw, about a mean of zero."""
 
-    Attributes:
-        velocity: Covariance of the velocities of d [mm^2/s^2], shape (3, 3).
-        acceleration: Covariance of the accelerations of d [mm^2/s^4], shape (3, 3).
-    """
-
-    velocity: Array
-    acceleration: Array
+    velocity: Array  # covariance of the velocities of d [mm^2/s^2], shape (3, 3)
+    acceleration: Array  # covariance of the accelerations of d [mm^2/s^4], shape (3, 3)
 
     @classmethod
     def of_take(cls, d: ArrayLike, fps: float) -> Speeds:

@@ -27,15 +27,10 @@ _ENTRY_TOLERANCE_MM = 1e-10
 
 @dataclass(frozen=True)
 class Spine:
-    """A line inside a bound, with one point (d2, d3) for every opening.
+    """A line inside a bound, with one point (d2, d3) for every opening."""
 
-    Attributes:
-        d1: Increasing openings, shape (n,) [mm].
-        middle: (d2, d3) at each opening, shape (n, 2) [mm]; the habitual path (0, 0) where that is deep inside.
-    """
-
-    d1: Array
-    middle: Array
+    d1: Array  # increasing openings, shape (n,) [mm]
+    middle: Array  # (d2, d3) at each opening, shape (n, 2) [mm]; the habitual path (0, 0) where that is deep inside
 
     @classmethod
     @lru_cache(maxsize=16)

@@ -50,24 +50,17 @@ _WORDS = {
 
 
 class Verdicts(NamedTuple):
-    """Result of `JawRig.validate`, one entry per pose.
+    """Result of `JawRig.validate`, one entry per pose."""
 
-    Attributes:
-        valid: Whether no `Reason` applies to the pose, bool, shape (...). Measured poses are also valid outside the
-            bound within the tolerance.
-        reason: `Reason` flags, uint8, shape (...); ``Reason(int(code))`` names them, `words` spells them out.
-        residual_mm: RMS landmark distance to the nearest pose of the model, (...); NaN if not finite or not rigid.
-        margin_mm: Signed distance of d to the bound, > 0 inside, shape (...); NaN if not finite or not rigid.
-        d: Nearest jaw parameters [mm], shape (..., 3); NaN if not finite or not rigid.
-        tolerance_mm: Maximum distance of a valid pose outside the bound.
-    """
-
+    #: whether no `Reason` applies to the pose, bool, shape (...). Measured poses are also valid outside the bound
+    #: within the tolerance
     valid: Mask
+    #: `Reason` flags, uint8, shape (...); ``Reason(int(code))`` names them, `words` spells them out
     reason: NDArray[np.uint8]
-    residual_mm: Array
-    margin_mm: Array
-    d: Array
-    tolerance_mm: float = 0.0
+    residual_mm: Array  # RMS landmark distance to the nearest pose of the model, (...); NaN if not finite or not rigid
+    margin_mm: Array  # signed distance of d to the bound, > 0 inside, shape (...); NaN if not finite or not rigid
+    d: Array  # nearest jaw parameters [mm], shape (..., 3); NaN if not finite or not rigid
+    tolerance_mm: float = 0.0  # maximum distance of a valid pose outside the bound
 
     def measured(self) -> Mask:
         """Return which poses were compared with the model: the finite and rigid ones."""
@@ -131,18 +124,12 @@ def place(margin_mm: float, tolerance_mm: float = 0.0) -> str:
 
 @dataclass(frozen=True)
 class Limits:
-    """Thresholds of a verdict.
+    """Thresholds of a verdict."""
 
-    Attributes:
-        residual_mm: Largest landmark distance to the model.
-        tolerance_mm: Maximum distance of a valid pose outside the bound: 0 for authored poses, the rig's tolerance for
-            measured ones.
-        speed_mm_s: Largest speed of any landmark since the last valid pose; None disables the check.
-    """
-
-    residual_mm: float
+    residual_mm: float  # largest landmark distance to the model
+    #: maximum distance of a valid pose outside the bound: 0 for authored poses, the rig's tolerance for measured ones
     tolerance_mm: float
-    speed_mm_s: float | None = None
+    speed_mm_s: float | None = None  # largest speed of any landmark since the last valid pose; None disables the check
 
     @property
     def margin_mm(self) -> float:

@@ -162,15 +162,10 @@ _JOINT_HINT = 'Store it as "joint" in the npz file, or state it in the correspon
 
 @dataclass(frozen=True, eq=False)
 class JawTrack:
-    """The jaw motion of a face model.
+    """The jaw motion of a face model."""
 
-    Attributes:
-        frames: frame numbers (F,).
-        T_model_jaw: motions of the jaw in the model's frame, translations in model units, shape (F, 4, 4).
-    """
-
-    frames: Array
-    T_model_jaw: Array
+    frames: Array  # frame numbers (F,)
+    T_model_jaw: Array  # motions of the jaw in the model's frame, translations in model units, shape (F, 4, 4)
 
     def poses(self, alignment: Alignment, T_rest: Array) -> Array:
         """Return T_skull_mandible (F, 4, 4) [mm], given the pose of the closed bite (4, 4).

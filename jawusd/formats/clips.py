@@ -36,23 +36,15 @@ _MOST_ATOMS = 100_000  # maximum number of atoms that are read, which limits the
 
 @dataclass(frozen=True)
 class ClipSource:
-    """Video or image sequence, with properties that its files may lack.
+    """Video or image sequence, with properties that its files may lack."""
 
-    Attributes:
-        path: the video file, or a pattern of image files as in `formats.file_names`.
-        fps: frame rate of an image sequence; ignored for videos.
-        colour_space: "display", "linear", "cineon" or a name in the OpenColorIO config; if None, the file type decides.
-        colour_config: OpenColorIO config.
-        pixel_aspect: width of a pixel divided by its height; if None, as stated in the file.
-        timecode: time code of the first image; if "", as stated in the file.
-    """
-
-    path: Path
-    fps: float | None = None
+    path: Path  # the video file, or a pattern of image files as in `formats.file_names`
+    fps: float | None = None  # frame rate of an image sequence; ignored for videos
+    #: "display", "linear", "cineon" or a name in the OpenColorIO config; if None, the file type decides
     colour_space: str | None = None
-    colour_config: Path | None = None
-    pixel_aspect: float | None = None
-    timecode: str = ""
+    colour_config: Path | None = None  # OpenColorIO config
+    pixel_aspect: float | None = None  # width of a pixel divided by its height; if None, as stated in the file
+    timecode: str = ""  # time code of the first image; if "", as stated in the file
 
     @property
     def is_light(self) -> bool:

@@ -26,21 +26,13 @@ _AXIS = re.compile(r"(.+)[_.:]([xyz])", re.IGNORECASE)
 
 @dataclass(frozen=True, eq=False)
 class FaceTable:
-    """Columns or points of a face over time.
+    """Columns or points of a face over time."""
 
-    Attributes:
-        frames: frame numbers or times of the rows, increasing, shape (F,).
-        X: columns (F, K), or points (F, N, 3) in the table's unit; NaN where hidden.
-        names: names of the columns or points; may be empty.
-        fps: frame rate [Hz]; 1 if `frames` are times [s], None if unknown.
-        unit: length unit of points, None if unknown.
-    """
-
-    frames: Array
-    X: Array
-    names: tuple[str, ...]
-    fps: float | None
-    unit: str | None = None
+    frames: Array  # frame numbers or times of the rows, increasing, shape (F,)
+    X: Array  # columns (F, K), or points (F, N, 3) in the table's unit; NaN where hidden
+    names: tuple[str, ...]  # names of the columns or points; may be empty
+    fps: float | None  # frame rate [Hz]; 1 if `frames` are times [s], None if unknown
+    unit: str | None = None  # length unit of points, None if unknown
 
 
 def header_of(path: str | os.PathLike[str]) -> list[str]:

@@ -56,19 +56,12 @@ _Rows = list[tuple[int, list[str]]]
 
 @dataclass(frozen=True, eq=False)
 class MarkerTable:
-    """Marker positions over a take.
+    """Marker positions over a take."""
 
-    Attributes:
-        points: positions in the file's unit, shape (F, N, 3), NaN where a marker is hidden.
-        names: marker names, empty if the file has none.
-        unit: unit of the positions, "mm", "cm" or "m"; None if the file states none.
-        fps: frame rate [Hz]; None if the file states none.
-    """
-
-    points: Array
-    names: tuple[str, ...] = ()
-    unit: str | None = None
-    fps: float | None = None
+    points: Array  # positions in the file's unit, shape (F, N, 3), NaN where a marker is hidden
+    names: tuple[str, ...] = ()  # marker names, empty if the file has none
+    unit: str | None = None  # unit of the positions, "mm", "cm" or "m"; None if the file states none
+    fps: float | None = None  # frame rate [Hz]; None if the file states none
 
 
 def mark_hidden(points: Array, zeros: bool = True) -> Array:

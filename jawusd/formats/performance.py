@@ -48,48 +48,30 @@ STATE_COLOURS: dict[SolveState, tuple[int, int, int]] = {
 
 @dataclass(eq=False)
 class Performance:
-    """Solved performance; every frame has a pose, and `covariance` is its uncertainty.
+    """Solved performance; every frame has a pose, and `covariance` is its uncertainty."""
 
-    Attributes:
-        frames: frame numbers of the reference camera, shape (F,).
-        T_world_upper: pose of the head, shape (F, 4, 4).
-        d: jaw parameters [mm], shape (F, 3).
-        covariance: covariance of head twist (in head axes about `pivot`; omega [rad], v [mm]) and of d [mm], shape
-            (F, 9, 9).
-        rig_covariance: covariance of d due to rig error [mm^2], shape (F, 3, 3).
-        rig_pose_covariance: covariance of the mandible's pose due to rig error, as a twist (omega [rad], v [mm]) in the
-            skull frame, shape (F, 6, 6).
-        pivot: reference point of the head twist, upper scan frame [mm], shape (3,).
-        state: `SolveState`, shape (F,).
-        found: arches whose outlines were used, (upper, lower), shape (F, 2).
-        use: which masks were used, or which cameras if there are no masks, shape (F, 2, C).
-        uncovered: fraction of each mask not covered by the scan, shape (F, 2, C); NaN without a mask.
-        residual_px, matched_px: standard deviation of outline residuals, and length of matched contour, shape (F, 2).
-        margin_mm: signed distance to the rig's bound, > 0 inside, shape (F,).
-        valid: whether the rig allows the pose (inside the bound or within the tolerance of measured poses), shape (F,).
-        verdict: the rig's verdict on each pose as text, length F.
-        camera_names: names of the cameras, length C.
-        notes: estimates that apply to the whole take.
-    """
-
-    frames: NDArray[np.int64]
-    T_world_upper: Array
-    d: Array
+    frames: NDArray[np.int64]  # frame numbers of the reference camera, shape (F,)
+    T_world_upper: Array  # pose of the head, shape (F, 4, 4)
+    d: Array  # jaw parameters [mm], shape (F, 3)
+    #: covariance of head twist (in head axes about `pivot`; omega [rad], v [mm]) and of d [mm], shape (F, 9, 9)
     covariance: Array
-    rig_covariance: Array
+    rig_covariance: Array  # covariance of d due to rig error [mm^2], shape (F, 3, 3)
+    #: covariance of the mandible's pose due to rig error, as a twist (omega [rad], v [mm]) in the skull frame, shape
+    #: (F, 6, 6)
     rig_pose_covariance: Array
-    pivot: Array
-    state: NDArray[np.int8]
-    found: Mask
-    use: Mask
-    uncovered: Array
-    residual_px: Array
-    matched_px: Array
-    margin_mm: Array
+    pivot: Array  # reference point of the head twist, upper scan frame [mm], shape (3,)
+    state: NDArray[np.int8]  # `SolveState`, shape (F,)
+    found: Mask  # arches whose outlines were used, (upper, lower), shape (F, 2)
+    use: Mask  # which masks were used, or which cameras if there are no masks, shape (F, 2, C)
+    uncovered: Array  # fraction of each mask not covered by the scan, shape (F, 2, C); NaN without a mask
+    residual_px: Array  # standard deviation of outline residuals, shape (F, 2)
+    matched_px: Array  # length of matched contour, shape (F, 2)
+    margin_mm: Array  # signed distance to the rig's bound, > 0 inside, shape (F,)
+    #: whether the rig allows the pose (inside the bound or within the tolerance of measured poses), shape (F,)
     valid: Mask
-    verdict: list[str]
-    camera_names: tuple[str, ...]
-    notes: dict[str, object] = field(default_factory=dict)
+    verdict: list[str]  # the rig's verdict on each pose as text, length F
+    camera_names: tuple[str, ...]  # names of the cameras, length C
+    notes: dict[str, object] = field(default_factory=dict)  # estimates that apply to the whole take
 
     @property
     def sigma_d(self) -> Array:
@@ -114,20 +96,13 @@ def write_performance(path: str | os.PathLike[str], performance: Performance, fp
 
 @dataclass(frozen=True, eq=False)
 class SolvedJaw:
-    """Jaw of a performance, stored in `tracks.npz`.
+    """Jaw of a performance, stored in `tracks.npz`."""
 
-    Attributes:
-        d: jaw parameters [mm], shape (F, 3).
-        sigma_mm: standard deviations of d [mm], shape (F, 3).
-        margin_mm: signed distance to the rig's bound, > 0 inside, shape (F,).
-        state: `SolveState`, shape (F,).
-        valid: whether the rig allows the pose (inside the bound or within the tolerance of measured poses), shape (F,).
-    """
-
-    d: Array
-    sigma_mm: Array
-    margin_mm: Array
-    state: NDArray[np.int8]
+    d: Array  # jaw parameters [mm], shape (F, 3)
+    sigma_mm: Array  # standard deviations of d [mm], shape (F, 3)
+    margin_mm: Array  # signed distance to the rig's bound, > 0 inside, shape (F,)
+    state: NDArray[np.int8]  # `SolveState`, shape (F,)
+    #: whether the rig allows the pose (inside the bound or within the tolerance of measured poses), shape (F,)
     valid: Mask
 
     def arrays(self) -> dict[str, Array]:

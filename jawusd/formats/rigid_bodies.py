@@ -22,14 +22,10 @@ _RIG_COUNT = "number of markers"
 
 @dataclass(frozen=True)
 class RigidBody:
-    """Rigid body: its markers and, if known, their positions on the body.
+    """Rigid body: its markers and, if known, their positions on the body."""
 
-    Attributes:
-        markers: numbers of the markers in the table, counted from 1, or names.
-        points: positions in the body's coordinate frame, in the unit of the file, shape (N, 3); None if unknown.
-    """
-
-    markers: tuple[int | str, ...]
+    markers: tuple[int | str, ...]  # numbers of the markers in the table, counted from 1, or names
+    #: positions in the body's coordinate frame, in the unit of the file, shape (N, 3); None if unknown
     points: Array | None
 
 

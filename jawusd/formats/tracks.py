@@ -78,54 +78,41 @@ class Tracks:
 
     Poses without prefix are final. `raw_` poses are from the first pass, without smoothing or kinematic prior; models
     are fitted to them and evaluated on them.
-
-    Attributes:
-        frames: frame numbers of the reference camera, shape (F,).
-        T_world_upper, T_world_lower, T_upper_lower: final poses, shape (F, 4, 4); T_upper_lower is T_skull_mandible.
-        raw_T_world_upper, raw_T_world_lower, raw_T_upper_lower: first-pass poses, shape (F, 4, 4).
-        status: `TrackStatus` of (upper, lower), shape (F, 2).
-        prior_aided: whether a frame was recovered with a kinematic prior, (F,). If the metadata has `prior_spread_mm`,
-            all final poses used a prior, as in tracking by colour.
-        coverage_error: fraction of mask pixels not covered by the projected scan (E_SP of paper eq. 8 over segmented
-            pixels), shape (F, 2, C); NaN without a mask.
-        masks_used: which masks were used for the raw poses, shape (F, 2, C); all other masks are missing or outliers.
-        covariance_upper, covariance_lower: covariance of the left twist xi [rad, mm] with T_true = exp(xi) T, world
-            frame, about the world origin, shape (F, 6, 6).
-        covariance_relative: covariance of T_upper_lower, defined likewise in the skull frame, shape (F, 6, 6).
-        sigma_mm: standard deviation of the landmarks' position in the skull frame [mm], shape (F, 5).
-        residual_px: rms distance of matched contour samples at the working size [px], shape (F, 2).
-        matched_px: matched contour length at the working size [px], shape (F, 2).
-        lost_reason: `LostReason` of the first pass, shape (F, 2); kept if a prior later recovered the pose. Optional in
-            files, like `lost_value` and `lost_limit`.
-        lost_value, lost_limit: the measured value and its limit, in the unit of the reason, shape (F, 2); NaN without
-            a reason.
-        camera_names: names of the cameras, length C.
-        solved: jaw parameters and state of each frame of a solved performance; otherwise None.
     """
 
-    frames: NDArray[np.int64]
-    T_world_upper: Array
+    frames: NDArray[np.int64]  # frame numbers of the reference camera, shape (F,)
+    T_world_upper: Array  # final pose, shape (F, 4, 4), like the next two
     T_world_lower: Array
-    T_upper_lower: Array
-    raw_T_world_upper: Array
+    T_upper_lower: Array  # T_skull_mandible
+    raw_T_world_upper: Array  # first-pass pose, shape (F, 4, 4), like the next two
     raw_T_world_lower: Array
     raw_T_upper_lower: Array
-    status: NDArray[np.int8]
+    status: NDArray[np.int8]  # `TrackStatus` of (upper, lower), shape (F, 2)
+    #: whether a frame was recovered with a kinematic prior, (F,). If the metadata has `prior_spread_mm`, all final
+    #: poses used a prior, as in tracking by colour
     prior_aided: Mask
+    #: fraction of mask pixels not covered by the projected scan (E_SP of paper eq. 8 over segmented pixels), shape (F,
+    #: 2, C); NaN without a mask
     coverage_error: Array
+    #: which masks were used for the raw poses, shape (F, 2, C); all other masks are missing or outliers
     masks_used: Mask
+    #: covariance of the left twist xi [rad, mm] with T_true = exp(xi) T, world frame, about the world origin, shape (F,
+    #: 6, 6)
     covariance_upper: Array
-    covariance_lower: Array
-    covariance_relative: Array
-    sigma_mm: Array
-    residual_px: Array
-    matched_px: Array
-    camera_names: tuple[str, ...]
+    covariance_lower: Array  # likewise
+    covariance_relative: Array  # covariance of T_upper_lower, likewise in the skull frame, shape (F, 6, 6)
+    sigma_mm: Array  # standard deviation of the landmarks' position in the skull frame [mm], shape (F, 5)
+    residual_px: Array  # rms distance of matched contour samples at the working size [px], shape (F, 2)
+    matched_px: Array  # matched contour length at the working size [px], shape (F, 2)
+    camera_names: tuple[str, ...]  # names of the cameras, length C
     meta: TracksMeta = field(default_factory=TracksMeta)
-    solved: SolvedJaw | None = None
+    solved: SolvedJaw | None = None  # jaw parameters and state of each frame of a solved performance; otherwise None
+    #: `LostReason` of the first pass, shape (F, 2); kept if a prior later recovered the pose. Optional in files, like
+    #: `lost_value` and `lost_limit`
     lost_reason: NDArray[np.uint8] = field(default_factory=lambda: np.zeros((0, 2), np.uint8))
+    #: measured value in the unit of the reason, shape (F, 2); NaN without a reason
     lost_value: Array = field(default_factory=lambda: np.zeros((0, 2)))
-    lost_limit: Array = field(default_factory=lambda: np.zeros((0, 2)))
+    lost_limit: Array = field(default_factory=lambda: np.zeros((0, 2)))  # limit of the value, shape (F, 2)
 
     def __post_init__(self) -> None:
         if not len(self.lost_reason):

@@ -46,29 +46,18 @@ _HAT = hat(np.eye(3)).reshape(3, 9)  # maps rows (n, 3) to skew matrices (n, 9)
 
 @dataclass(frozen=True)
 class ChartMotion:
-    """A motion in the anatomical frame and its derivatives with respect to the chart, for rows of poses.
+    """A motion in the anatomical frame and its derivatives with respect to the chart, for rows of poses."""
 
-    Attributes:
-        R: rotation, shape (n, 3, 3).
-        shift: displacement of the model's reference point [mm], shape (n, 1, 3).
-        w: spatial derivatives of the rotation [rad/mm], one row for each coordinate, shape (n, 3, 3).
-        shift_x: derivatives of the displacement, one row for each coordinate, shape (n, 3, 3), or (1, 3, 3).
-    """
-
-    R: Value
-    shift: Value
-    w: Value
-    shift_x: Value
+    R: Value  # rotation, shape (n, 3, 3)
+    shift: Value  # displacement of the model's reference point [mm], shape (n, 1, 3)
+    w: Value  # spatial derivatives of the rotation [rad/mm], one row for each coordinate, shape (n, 3, 3)
+    shift_x: Value  # derivatives of the displacement, one row for each coordinate, shape (n, 3, 3), or (1, 3, 3)
 
 
 class Chart(Protocol):
-    """The chart of one model.
+    """The chart of one model."""
 
-    Attributes:
-        point: the reference point at rest, anatomical frame [mm], shape (3,).
-    """
-
-    point: Array
+    point: Array  # the reference point at rest, anatomical frame [mm], shape (3,)
 
     def start(self, g: Graph, u: Value) -> Value:
         """Return starting points (n, 3) for motions that displace the lower incisal point by u (n, 3) [mm]."""
@@ -257,20 +246,13 @@ CHARTS: dict[str, Callable[[JawRig], Chart]] = {ANCHORED: AnchoredChart, ADDITIV
 
 @dataclass(frozen=True)
 class _Turning:
-    """Powers of the skew matrix W of rotation vectors, and the coefficients of Rodrigues' formula.
+    """Powers of the skew matrix W of rotation vectors, and the coefficients of Rodrigues' formula."""
 
-    Attributes:
-        omega: rotation vectors [rad], shape (n, 3).
-        squared: their squared lengths [rad^2], shape (n, 1).
-        W, WW: the skew matrix and its square, shape (n, 9).
-        coefficients: a, b and c of `jawusd.geometry.rodrigues`, shape (n, 1) each.
-    """
-
-    omega: Value
-    squared: Value
-    W: Value
-    WW: Value
-    coefficients: Triple[Value]
+    omega: Value  # rotation vectors [rad], shape (n, 3)
+    squared: Value  # their squared lengths [rad^2], shape (n, 1)
+    W: Value  # the skew matrix, shape (n, 9)
+    WW: Value  # its square, shape (n, 9)
+    coefficients: Triple[Value]  # a, b and c of `jawusd.geometry.rodrigues`, shape (n, 1) each
 
     @classmethod
     def of(cls, g: Graph, omega: Value) -> _Turning:

@@ -46,19 +46,12 @@ class Value(Symbol):
 
 @dataclass(eq=False)
 class Graph:
-    """A graph under construction, of one floating-point type; implements `Operations` on its values.
+    """A graph under construction, of one floating-point type; implements `Operations` on its values."""
 
-    Attributes:
-        dtype: float32 or float64.
-        prefix: Prefix of all names; nested graphs must not share names.
-        nodes: Operators added so far.
-        initializers: Constants added so far.
-    """
-
-    dtype: FloatType
-    prefix: str = ""
-    nodes: list[onnx.NodeProto] = field(default_factory=list)
-    initializers: list[onnx.TensorProto] = field(default_factory=list)
+    dtype: FloatType  # float32 or float64
+    prefix: str = ""  # prefix of all names; nested graphs must not share names
+    nodes: list[onnx.NodeProto] = field(default_factory=list)  # operators added so far
+    initializers: list[onnx.TensorProto] = field(default_factory=list)  # constants added so far
     _found: dict[tuple[str, ...], Value] = field(default_factory=dict)
     _polynomials: dict[tuple[str, bytes], list[Value]] = field(default_factory=dict)
     _constants: dict[tuple[str, tuple[int, ...], bytes], Value] = field(default_factory=dict)

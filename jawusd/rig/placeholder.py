@@ -48,17 +48,11 @@ _EMINENCE_MM = (10.5, 6.1, 5.0)
 
 @dataclass(frozen=True)
 class Estimate:
-    """Which bones of a rig are estimated, and how well their condyles are known.
+    """Which bones of a rig are estimated, and how well their condyles are known."""
 
-    Attributes:
-        bones: Names of the estimated meshes.
-        condyles: Source of the condyle positions.
-        error_mm: Expected error of a condyle centre [mm]; None if it is not known.
-    """
-
-    bones: tuple[str, ...]
-    condyles: str
-    error_mm: float | None
+    bones: tuple[str, ...]  # names of the estimated meshes
+    condyles: str  # source of the condyle positions
+    error_mm: float | None  # expected error of a condyle centre [mm]; None if it is not known
 
 
 def with_estimated_bones(rig: JawRig, meshes: Mapping[str, Mesh]) -> tuple[dict[str, Mesh], Estimate | None]:

@@ -39,39 +39,23 @@ _SAME_MM = 1e-6  # difference [mm] below which keys of d count as equal
 
 
 class StageMotion(NamedTuple):
-    """A motion of a rig in a stage.
+    """A motion of a rig in a stage."""
 
-    Attributes:
-        frames: Increasing times, shape (F,).
-        d: Jaw parameters [mm], shape (F, 3), NaN in lost frames.
-        fps: Frames per second.
-        origin: Source of the motion: the keys of d or the mandible's transforms.
-        residual_mm: Distance of the mandible's poses from the model, shape (F,); zero for d.
-        fitted: Whether the rig's meshes were fitted to a stage without the rig.
-        prim: Path of the rig's prim in the stage; empty if fitted.
-    """
-
-    frames: Array
-    d: Array
-    fps: float
-    origin: Origin
-    residual_mm: Array
-    fitted: bool = False
-    prim: str = ""
+    frames: Array  # increasing times, shape (F,)
+    d: Array  # jaw parameters [mm], shape (F, 3), NaN in lost frames
+    fps: float  # frames per second
+    origin: Origin  # source of the motion: the keys of d or the mandible's transforms
+    residual_mm: Array  # distance of the mandible's poses from the model, shape (F,); zero for d
+    fitted: bool = False  # whether the rig's meshes were fitted to a stage without the rig
+    prim: str = ""  # path of the rig's prim in the stage; empty if fitted
 
 
 class Deviation(NamedTuple):
-    """Deviation of a mandible from the pose given by d.
+    """Deviation of a mandible from the pose given by d."""
 
-    Attributes:
-        frames: Number of frames that deviate.
-        of: Number of frames compared.
-        largest_mm: Largest landmark distance.
-    """
-
-    frames: int
-    of: int
-    largest_mm: float
+    frames: int  # number of frames that deviate
+    of: int  # number of frames compared
+    largest_mm: float  # largest landmark distance
 
 
 @raises_format_error(0)

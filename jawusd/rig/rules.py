@@ -36,19 +36,12 @@ _PROBES = 500  # number of random valid d at which the table is compared with th
 
 @dataclass(frozen=True)
 class Finding:
-    """A violation of a rule, or a note.
+    """A violation of a rule, or a note."""
 
-    Attributes:
-        severity: "error", "warning" or "info".
-        rule: Name of the rule.
-        path: Path of the prim or attribute.
-        message: The value that was found, and the allowed values.
-    """
-
-    severity: str
-    rule: str
-    path: str
-    message: str
+    severity: str  # "error", "warning" or "info"
+    rule: str  # name of the rule
+    path: str  # path of the prim or attribute
+    message: str  # the value that was found, and the allowed values
 
 
 Rule = Callable[[Usd.Prim], Iterator[Finding]]

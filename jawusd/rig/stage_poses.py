@@ -34,21 +34,13 @@ _SKULL, _MANDIBLE = ("upper_teeth", "skull"), ("lower_teeth", "mandible")
 
 
 class StagePoses(NamedTuple):
-    """Poses fitted to a stage.
+    """Poses fitted to a stage."""
 
-    Attributes:
-        frames: Frame numbers, shape (F,).
-        T: T_skull_mandible [mm], shape (F, 4, 4).
-        fps: Frames per second.
-        misfit_mm: RMS distance of the fitted meshes from those of the stage, maximum over frames.
-        meshes: Paths of the fitted prims of skull and mandible.
-    """
-
-    frames: NDArray[np.int64]
-    T: Array
-    fps: float
-    misfit_mm: float
-    meshes: tuple[str, str]
+    frames: NDArray[np.int64]  # frame numbers, shape (F,)
+    T: Array  # T_skull_mandible [mm], shape (F, 4, 4)
+    fps: float  # frames per second
+    misfit_mm: float  # RMS distance of the fitted meshes from those of the stage, maximum over frames
+    meshes: tuple[str, str]  # paths of the fitted prims of skull and mandible
 
 
 def carries_rig(path: str | os.PathLike[str], prim_path: str | None = None) -> bool:

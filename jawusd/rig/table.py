@@ -123,22 +123,16 @@ def _curvature(rig: JawRig, box: Array, points: Array, axis: int) -> Array:
 class DecoderTable:
     """Twists sampled over d.
 
-    Attributes:
-        format: "grid" (twists over the three axes) or "curves" (three curves that are summed).
-        axes: Values of d1, d2, d3 [mm], each array increasing.
-        twists: Twists (omega [rad], v [mm]) in the skull frame, float32: (n1, n2, n3, 6), or (n1 + n2 + n3, 6).
-        max_error_mm: Largest distance of a vertex from the exact model.
-        error_samples: Number of valid d at which `max_error_mm` was measured.
-
     Raises:
         ValueError: Shapes that do not match, or values that do not increase.
     """
 
-    format: str
-    axes: tuple[Array, Array, Array]
+    format: str  # "grid" (twists over the three axes) or "curves" (three curves that are summed)
+    axes: tuple[Array, Array, Array]  # values of d1, d2, d3 [mm], each array increasing
+    #: twists (omega [rad], v [mm]) in the skull frame, float32: (n1, n2, n3, 6), or (n1 + n2 + n3, 6)
     twists: NDArray[np.float32]
-    max_error_mm: float = 0.0
-    error_samples: int = 0
+    max_error_mm: float = 0.0  # largest distance of a vertex from the exact model
+    error_samples: int = 0  # number of valid d at which `max_error_mm` was measured
 
     def __post_init__(self) -> None:
         counts = tuple(len(axis) for axis in self.axes)

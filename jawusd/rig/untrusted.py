@@ -29,21 +29,13 @@ from jawusd.rig.layout import SCHEMA_NAME
 
 
 class _LayerRef(NamedTuple):
-    """A layer that another layer refers to.
+    """A layer that another layer refers to."""
 
-    Attributes:
-        target: Full path of the layer.
-        rig_folder: Folder of the rig that the layer is part of; None if it is not part of a rig.
-        user: A layer in another folder that refers to this layer, if any.
-        variables: Expression variables of the layers that refer to this layer.
-        is_sublayer: Whether the layer is a sublayer; a sublayer's own variables are ignored.
-    """
-
-    target: str
-    rig_folder: Path | None
-    user: str | None
-    variables: Mapping[str, object]
-    is_sublayer: bool = False
+    target: str  # full path of the layer
+    rig_folder: Path | None  # folder of the rig that the layer is part of; None if it is not part of a rig
+    user: str | None  # a layer in another folder that refers to this layer, if any
+    variables: Mapping[str, object]  # expression variables of the layers that refer to this layer
+    is_sublayer: bool = False  # whether the layer is a sublayer; a sublayer's own variables are ignored
 
 
 P = ParamSpec("P")
