@@ -31,11 +31,7 @@ _MATRIX_COLUMNS = [f"m{row}{column}" for row in range(4) for column in range(4)]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command and return the exit code.
-
-    Args:
-        arguments: Command line without the program name; `sys.argv` if None.
-    """
+    """Run one command, given without the program's name (None: `sys.argv`), and return the exit code."""
     options = _parser().parse_args(arguments)
     try:
         return options.run(load(options.model), options)
@@ -146,11 +142,7 @@ def _plain(value: object) -> object:
 
 
 def _read_poses(path: Path) -> tuple[list[int], Array]:
-    """Return frame numbers and T_skull_mandible (F, 4, 4) of a CSV table; nan and inf are kept.
-
-    Raises:
-        FormatError: a column is missing, or a cell is not a number.
-    """
+    """Return frame numbers and T_skull_mandible (F, 4, 4) of a CSV table; nan and inf are kept."""
     table = read_table(path, _MAX_BYTES)
     missing = [name for name in ("frame", *_MATRIX_COLUMNS) if name not in table.header]
     if missing:

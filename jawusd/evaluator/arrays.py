@@ -39,12 +39,7 @@ class HeldOut(NamedTuple):
 
 
 class RigArrays:
-    """The arrays and the header of a rig.
-
-    Attributes:
-        arrays: Named arrays, read-only; `jawusd.evaluator.kinds` lists them.
-        meta: The header of the file.
-    """
+    """The arrays of a rig by name (see `jawusd.evaluator.kinds`), read-only, and `meta`, the header of its file."""
 
     def __init__(self, arrays: Mapping[str, ArrayLike], meta: Mapping[str, object]) -> None:
         """Check and store the arrays and the header.
@@ -154,11 +149,7 @@ class RigArrays:
 
 
 def checked_arrays(arrays: Mapping[str, ArrayLike], kind: str) -> dict[str, Array]:
-    """Check the arrays of a rig of the given kind, and return them as read-only float64.
-
-    Args:
-        arrays: Named arrays (see `jawusd.evaluator.kinds`); arrays with other names are ignored.
-        kind: "anchored" or "additive".
+    """Return the arrays of a rig of a kind as read-only float64 after checking them, without those of other names.
 
     Raises:
         EvaluatorError: an unknown kind, or an array that is missing, of a wrong shape, not finite or out of range.

@@ -1,10 +1,8 @@
 """Authoring with a rig: curves between key frames, slider ranges, and ranges normalised for retargeting.
 
-Curves between keys are straight lines as in the paper, or smooth curves without overshoot. A smooth curve is cubic
-between keys, separately in each parameter, with tangents that keep it monotone (F. N. Fritsch and R. E. Carlson,
-Monotone Piecewise Cubic Interpolation, SIAM J. Numer. Anal. 17, 1980). They are computed as by F. N. Fritsch and J.
-Butland (SIAM J. Sci. Stat. Comput. 5, 1984): the weighted harmonic mean of the slopes on both sides, zero at extrema
-and next to constant segments. The curve starts and stops at rest.
+Smooth curves are cubic between keys, separately in each parameter, with tangents that keep them monotone (Fritsch and
+Carlson 1980): the weighted harmonic mean of the slopes on both sides, zero at extrema, at both ends and next to
+constant segments (Fritsch and Butland 1984).
 """
 
 from __future__ import annotations
@@ -58,8 +56,7 @@ def interpolate_smooth(
 ) -> Array:
     """Return d (m, 3) [mm] at times ``at`` on a C1 curve through the keys (k, 3); constant outside the keys.
 
-    The curve is monotone between keys without given tangents. A segment between valid keys that would leave the bound
-    follows it instead, and is then only continuous.
+    A segment between valid keys that would leave the bound follows it instead, and is then only continuous.
     """
     if len(keys) == 1:
         return np.broadcast_to(keys, (len(at), 3)).copy()
@@ -118,20 +115,17 @@ class RigAuthoring(RigArrays):
         inside: bool = True,
         tangents: ArrayLike | None = None,
     ) -> Array:
-        """Return jaw parameters between keys.
+        """Return jaw parameters [mm] between keys, shape (*at.shape, 3).
 
         Args:
             frames: Increasing key times, shape (K,).
             d_keys: Jaw parameters [mm] at the keys, shape (K, 3).
-            at: Query times, any shape; before the first key and after the last one, d is constant.
-            method: "linear" for straight lines in d as in the paper, or "smooth" for a C1 curve, monotone between keys.
-            tangents: Slopes of the smooth curve at the keys [mm per unit of time], shape (K, 3); NaN and None: those
-                with which it is monotone between keys. Lines do not use them.
-            inside: Where the smooth curve between two valid keys would leave the bound, follow the bound instead; the
-                curve is then only continuous. See `keep_inside` for keys outside the bound.
-
-        Returns:
-            Jaw parameters [mm], shape (*at.shape, 3).
+            at: Query times, any shape; d is constant before the first key and after the last one.
+            method: "linear", or "smooth" for a C1 curve, monotone between keys.
+            inside: Where the smooth curve between two valid keys would leave the bound, follow the bound; the curve is
+                then only continuous. See `keep_inside` for keys outside the bound.
+            tangents: Slopes of the smooth curve at the keys [mm per unit of time], shape (K, 3); NaN and None: monotone
+                ones.
 
         Raises:
             ValueError: wrong shapes, keys that are not finite, infinite tangents, frames that do not increase, or an
@@ -166,16 +160,10 @@ class RigAuthoring(RigArrays):
         return kept_inside(self.bound, *as_keys(times, d))
 
     def ranges(self, d1: ArrayLike, d2: ArrayLike = 0.0, d3: ArrayLike = 0.0) -> Ranges:
-        """Return the valid ranges of d2 and of d3, each varied with the other two parameters fixed.
+        """Return the valid ranges [mm] of d2 at d1 and d3, and of d3 at d1 and d2; d1, d2, d3 [mm] broadcast to (...).
 
-        Args:
-            d1: Opening [mm]; d1, d2, d3 broadcast to one shape (...).
-            d2: Laterotrusion [mm] while d3 varies.
-            d3: Protrusion [mm] while d2 varies.
-
-        Returns:
-            The limits [mm]; NaN where no value is valid. The bound ends a few tenths of a mm inside ``d_range[0]``;
-            for openings between the two, the limits at the nearest valid opening are returned.
+        Limits are NaN where no value is valid. The bound ends a few tenths of a mm inside ``d_range[0]``; for openings
+        between the two, the limits at the nearest valid opening are returned.
         """
         each = (as_floats(x, name) for x, name in ((d1, "d1"), (d2, "d2"), (d3, "d3")))
         d = np.stack(np.broadcast_arrays(*each), axis=-1)
@@ -186,16 +174,10 @@ class RigAuthoring(RigArrays):
         return Ranges(*(end.reshape(batch) for pair in ends for end in pair))
 
     def normalized(self, d: ArrayLike) -> Array:
-        """Return d as fractions of this subject's ranges, for retargeting to another subject.
+        """Return d (..., 3) [mm] as fractions of this subject's ranges, for retargeting to another subject.
 
         The opening is divided by the full opening; d2 and d3 are divided by the range on their side of the habitual
         path at that opening (at least 0.5 mm).
-
-        Args:
-            d: Jaw parameters [mm], shape (..., 3).
-
-        Returns:
-            Fractions, shape (..., 3): 1 is the full range.
         """
         rows, batch = as_rows(d, (3,), "d")
         return in_chunks(lambda d: normalized(self.bound, self.d_range, d), rows).reshape(*batch, 3)
@@ -211,12 +193,9 @@ class RigAuthoring(RigArrays):
         return in_chunks(lambda d: nearest_distance(self.captured_d, d), rows).reshape(batch)
 
     def landmark_sigma_mm(self, d: ArrayLike) -> Array:
-        """Return the root mean square error of the model at its landmarks, shape (..., n) [mm]; 0 if unknown.
+        """Return the rms error of the model at its landmarks, (..., n) [mm], at d (..., 3) [mm]; 0 if unknown.
 
         It was estimated from held-out frames, and grows with the distance from the captured poses.
-
-        Args:
-            d: Jaw parameters [mm], shape (..., 3).
         """
         near_mm, growth = self.error_growth.T
         distance_mm = self.captured_distance(d)[..., None] if len(self.captured_d) else 0.0

@@ -60,10 +60,7 @@ def as_rows(values: ArrayLike, tail: tuple[int, ...], name: str) -> tuple[Array,
 
 
 def in_chunks(function: Callable[[Rows], Array], rows: Rows) -> Array:
-    """Return ``function(rows)`` computed in chunks of `CHUNK_ROWS` rows.
-
-    Temporary memory does not grow with the number of rows.
-    """
+    """Return ``function(rows)``, computed in chunks of `CHUNK_ROWS` rows to limit temporary memory."""
     if len(rows) <= CHUNK_ROWS:
         return function(rows)
     return np.concatenate([function(rows[i : i + CHUNK_ROWS]) for i in range(0, len(rows), CHUNK_ROWS)])

@@ -83,8 +83,8 @@ class SliceHull:
     def signed_distance_curvature(self, d: Array) -> tuple[Array, Array, Array]:
         """Return signed distance (n,), gradient (n, 3), and the part of the Hessian due to rounding, (n, 3, 3) [1/mm].
 
-        The rest of the Hessian, from the curvature of the supports along d1, is omitted: the result is positive
-        semidefinite, so that solver steps point downhill.
+        Without the curvature of the supports along d1, it is positive semidefinite, so that solver steps point
+        downhill.
         """
         reach, reach_1 = self.supports.value_and_slope(d[:, 0])
         distance, weights = self._joined(d, reach)

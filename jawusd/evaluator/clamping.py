@@ -46,17 +46,13 @@ class Inside(NamedTuple):
 
 
 def kept_inside(bound: SliceHull, times: Array, d: Array, *, ends_stay: bool = False) -> Inside:
-    """Return a motion clamped to the bound, at its samples and between them.
+    """Return a motion clamped to the bound, also between its samples, with no step more than 5 % longer than before.
 
     Args:
         times: Increasing times, shape (F,).
         d: Jaw parameters [mm], finite, linear between the times, shape (F, 3).
-        ends_stay: Where every path inside is too long, exceed the speed limit instead of retiming the motion before
-            and after.
-
-    Returns:
-        The motion inside the bound: unchanged where it is inside, elsewhere with no step more than 5 % longer than the
-        original.
+        ends_stay: Where every path inside is too long, exceed the speed limit instead of retiming the motion before and
+            after.
 
     Raises:
         EvaluatorError: the bound is empty.
@@ -112,10 +108,7 @@ def _widened(path: Array, allowed: Array, first: int, last: int) -> tuple[int, i
 
 
 def _retimed(bound: SliceHull, spine: Spine, path: Array, allowed: Array, ends_stay: bool) -> Array:
-    """Return the path (n, 3) retimed so that the length up to each point grows no faster than ``allowed`` (n,) [mm].
-
-    The ends stay fixed, unless the time is too short for the whole path and ``ends_stay`` is false.
-    """
+    """Return the path (n, 3) retimed to grow no faster than ``allowed`` (n,) [mm], with fixed ends if possible."""
     allowed = allowed - allowed[0]
     if (np.diff(lengths(path)) <= np.diff(allowed) + _STILL_MM).all():
         return path
@@ -226,11 +219,7 @@ def _cut_short(bound: SliceHull, path: Array) -> Array:
 
 
 def _tightened(bound: SliceHull, corners: Array, most_mm: float) -> Array:
-    """Return a path (n, 3) between the same ends, tightened until it is no longer than ``most_mm``.
-
-    Segments of the path, long ones first, are moved towards the straight line between their ends as far as the bound
-    allows.
-    """
+    """Return a path (n, 3) between the same ends, its segments straightened, long ones first, down to ``most_mm``."""
     length = lengths(corners)
     path = along(corners, length, np.union1d(np.linspace(0.0, length[-1], _TIGHT_POINTS), length))
     for _ in range(_TIGHT_ROUNDS):

@@ -12,15 +12,7 @@ from jawusd.geometry.rodrigues import N, Triple, dot
 
 
 def cubic(h: N, y0: N, y1: N, m0: N, m1: N) -> tuple[N, N, N, N]:
-    """Return the coefficients, powers 0 to 3, of the cubic Hermite polynomial over an interval of length h.
-
-    Args:
-        h: Length of the interval.
-        y0: Value at its start.
-        y1: Value at its end.
-        m0: Slope at its start.
-        m1: Slope at its end.
-    """
+    """Return the coefficients, powers 0 to 3, of the cubic over a length h with values y0, y1 and slopes m0, m1."""
     rise = (y1 - y0) / h
     return y0, m0, (3.0 * rise - 2.0 * m0 - m1) / h, (m0 + m1 - 2.0 * rise) / (h * h)
 
@@ -45,15 +37,9 @@ _CURVE_TABLES = ("start", "power0", "power1", "power2", "power3")
 def curve_tables(name: str, knots: Sequence[float], values: Rows, slopes: Rows) -> dict[str, Rows]:
     """Return the tables of a C1 cubic Hermite curve, continued straight outside its knots; see `curve`.
 
-    Args:
-        name: Prefix of the names of the tables.
-        knots: n increasing parameter values.
-        values: Points of the curve at the knots, n rows.
-        slopes: Derivatives at the knots, n rows.
-
-    Returns:
-        The knots; and for each of the n + 1 intervals, including the two straight ends, its start and its polynomial
-        coefficients, powers 0 to 3.
+    They hold the n knots and, for each of the n + 1 intervals with the straight ends, its start and coefficients,
+    powers 0 to 3. `values` and `slopes` are n rows of points and derivatives at the knots; `name` begins the tables'
+    names.
     """
     still = [0.0] * len(values[0])
     pieces = [[[knots[0]], values[0], slopes[0], still, still]]
@@ -112,11 +98,9 @@ def spline(
 
     Args:
         q: The argument; see `spline_input`.
-        centres: The centres c_i, one per row.
-        weights: The kernel weights W_i, one per row.
-        linear: The linear terms, 3 inputs times 3 outputs.
+        centres, weights: c_i and W_i, one per row.
+        linear: L, 3 inputs times 3 outputs.
         spread: See `spread_of`.
-        ops: Operations of the number type.
     """
     kernels = []
     reference = None if spread is None else ops.sqrt(dot(q, q) + 1.0)

@@ -74,7 +74,6 @@ class GlideTable:
     """The tooth-glide surface measured on scans: how far the jaw must open to slide with the teeth together.
 
     The surface is ``sum_r a_r(d2) b_r(d3)`` [mm]; each factor is a C1 cubic Hermite curve, constant outside its knots.
-    The sum is stored expanded, as one bicubic polynomial for every cell between knots.
 
     Attributes:
         knots: Increasing knots of d2 and of d3 [mm].

@@ -56,10 +56,9 @@ class Handles(NamedTuple):
 
     @classmethod
     def of(cls, points: Array, weights: ArrayLike | None, sight: Array) -> Handles:
-        """Return handles at points (H, 3) [mm], scaled so that sums of squares are weighted means.
+        """Return handles at points (H, 3) [mm] at rest, anatomical frame; sums of their squares are weighted means.
 
         Args:
-            points: Points of the mandible at rest, anatomical frame [mm], shape (H, 3).
             weights: Weights, shape (H,); None for equal ones.
             sight: Directions along which distances do not count, anatomical frame, shape (H, 3), of any length or 0.
 
@@ -107,14 +106,7 @@ def vector_images(R: Array, t: Array, vectors: Array) -> Array:
 
 
 def point_velocities(R: Array, t: Array, S: Array, points: Array) -> Array:
-    """Return the derivatives (n, p, 3, 3) of moved points (p, 3) [mm] with respect to d.
-
-    Args:
-        R: Rotations, shape (n, 3, 3).
-        t: Translations [mm], shape (n, 3).
-        S: Their spatial derivatives (see `jawusd.evaluator.models`), shape (n, 6, 3).
-        points: Points before the motion [mm], shape (p, 3).
-    """
+    """Return the derivatives (n, p, 3, 3) by d of points (p, 3) [mm] moved by R (n, 3, 3), t (n, 3), S (n, 6, 3)."""
     image = points @ np.swapaxes(R, 1, 2) + t[:, None]
     return np.cross(S[:, None, :3], image[..., None], axis=2) + S[:, None, 3:]
 
@@ -159,13 +151,7 @@ class WeightedEncoding(NamedTuple):
 
 
 class Encoder:
-    """Encoder of poses for one model, in numpy.
-
-    Args:
-        model: The jaw model.
-        frames: The coordinate frames of the rig.
-        vectors: The four vectors that represent the landmarks; see `landmark_vectors`.
-    """
+    """Encoder of poses for one model, given the `landmark_vectors` of its rig."""
 
     def __init__(self, model: JawModelForm, frames: RigFrames, vectors: Array) -> None:
         self._model, self._frames, self._vectors = model, frames, vectors
@@ -190,10 +176,9 @@ class Encoder:
         return self._model.chart_parameters(nearest_in_chart(self._model, R, t, self._vectors))
 
     def most_likely(self, T: Array, whitening: Array, start: Array, bound: SliceHull | None) -> Array:
-        """Return the most likely d (n, 3) of noisy poses: minimise ``|W xi|^2`` with ``T = exp(xi) pose(d)``.
+        """Return the most likely d (n, 3) of noisy poses T (n, 4, 4): minimise ``|W xi|^2``, ``T = exp(xi) pose(d)``.
 
         Args:
-            T: Poses T_skull_mandible, shape (n, 4, 4).
             whitening: W with ``W^T W`` the inverse covariance of xi, (omega, v), skull frame, shape (n, 6, 6).
             start: Initial d [mm], shape (n, 3), inside the bound if given. NaN gives NaN.
             bound: The bound that d must stay inside.
@@ -210,11 +195,8 @@ class Encoder:
         """Return the covariances (n, 3, 3) [mm^2] of the most likely d (n, 3), disregarding the bound.
 
         With J the derivative of ``W xi``, the covariance from noise is ``(J^T J)^-1``, and a second error of the pose
-        with covariance O adds ``G O G^T`` with the gain ``G = (J^T J)^-1 J^T W`` (Barfoot 2017, section 3.1).
-
-        Args:
-            d, T, whitening: As for `most_likely`.
-            own: Covariance O of the rig's own error, (omega, v), skull frame, shape (n, 6, 6).
+        with covariance O (``own``, (omega, v), skull frame, (n, 6, 6)) adds ``G O G^T`` with the gain ``G = (J^T J)^-1
+        J^T W`` (Barfoot 2017, section 3.1). The other arguments are those of `most_likely`.
         """
         known = np.isfinite(d).all(axis=1)
         found = np.full((len(d), 3, 3), np.nan)
@@ -243,11 +225,9 @@ def nearest_in_chart(model: JawModelForm, R: Array, t: Array, vectors: Array) ->
 
 
 def covariance_of_points(points: Array, sigma_mm: Array) -> Array:
-    """Return covariances of twists (omega [rad], v [mm]) that reproduce the errors of points, shape (n, 6, 6).
+    """Return covariances (n, 6, 6) of twists (omega [rad], v [mm]) that give points (n, p, 3) rms errors (n, p) [mm].
 
-    Args:
-        points: Positions of points of a rigid body [mm], shape (n, p, 3).
-        sigma_mm: Root mean square errors of the points, shape (n, p); where one is 0, the result is 0.
+    Where an error is 0, the covariance is 0.
     """
     known = sigma_mm.all(axis=1)
     points, found = points[known], np.zeros((len(points), 6, 6))

@@ -1,12 +1,9 @@
 """The jaw model's formulas, written once for every number type.
 
-Each function takes numbers with ``+ - * /`` (floats, numpy arrays, torch tensors, values of an ONNX graph) and, where
-a formula needs more, an `Operations` object for that number type. `jawusd.evaluator.kinds` combines them into models.
-The torch layer, the ONNX exporter and the single-file reader are built from these models and `BoundFormula`.
-`jawusd.evaluator.gauge` is the only other implementation of the gauge, with derivatives.
-
-This file imports only the standard library and modules that do the same: all of them are copied into the single-file
-reader, which runs in Python 3.9.
+Each function takes numbers with ``+ - * /`` and, where a formula needs more, an `Operations` object for that number
+type; `jawusd.evaluator.kinds` combines them into models. Only `jawusd.evaluator.gauge` has the gauge a second time,
+with derivatives. This file imports only the standard library and modules that do the same: all of them are copied into
+the single-file reader, which runs in Python 3.9.
 
 The gauge maps the parameters d = (d1 opening, d2 laterotrusion, d3 protrusion) [mm] to the displacement u [mm] of the
 lower incisal point, anatomical frame (x left, y up, z anterior):
@@ -60,10 +57,7 @@ class GaugeNumbers(NamedTuple):
 
 
 def long_angle_series() -> list[list[float]]:
-    """Return the coefficients of a, b and c of `jawusd.geometry.rodrigues` as series of the squared angle [rad^2].
-
-    Each series has eight terms and is accurate to 1e-8 up to 2 rad.
-    """
+    """Return a, b and c of `jawusd.geometry.rodrigues` as series of the squared angle [rad^2], to 1e-8 up to 2 rad."""
     return [[(-1.0) ** k / math.factorial(2 * k + start) for k in range(8)] for start in (1, 2, 3)]
 
 

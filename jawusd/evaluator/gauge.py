@@ -145,9 +145,8 @@ def displacement(
 def opening_equation(gauge: GaugeNumbers, u: Triple[N], d1: N, f: Elementary[N]) -> tuple[N, N, N, N]:
     """Return the inverse gauge reduced to one equation in d1 [mm].
 
-    Returns:
-        d2, d3 [mm] that match the x and z of u at d1, the residual ``d1 + drop fade + y`` [mm], which is zero at the
-        solution, and its derivative with respect to d1.
+    Returns d2, d3 [mm] that match the x and z of u at d1, the residual ``d1 + drop fade + y`` [mm], zero at the
+    solution, and its derivative by d1.
     """
     gx, gz, gx_1, gz_1 = path(gauge, d1, f)
     d2 = u[0] - gx
@@ -278,11 +277,10 @@ class Gauge:
         return np.stack(u, axis=-1), jacobian
 
     def inverse(self, u: Array) -> Array:
-        """Return the d (n, 3) [mm] whose incisal displacement is u (n, 3) [mm].
+        """Return the d (n, 3) [mm] whose incisal displacement is u (n, 3) [mm]; NaN for rows that do not converge.
 
-        For a given d1 the other two follow in closed form, so this is a root search in one variable: Newton with the
-        analytic derivative, inside the tightest bracket so far. Rows that do not converge become NaN. A single row is
-        solved by the function `inverse`, the same search in floats.
+        For a given d1 the other two follow in closed form: Newton in d1 inside the tightest bracket so far. A single
+        row is solved in floats, by the function `inverse`.
         """
         finite = np.isfinite(u).all(axis=1)
         if len(u) == 1 and finite.all():

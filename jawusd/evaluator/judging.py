@@ -37,15 +37,11 @@ class RigJudging(RigClearance, RigArrays):
     polygons: PolygonBound  # the paper's bound
 
     def margin(self, d: ArrayLike, *, bound: BoundName = "slices") -> Array:
-        """Return the signed distance of d to the bound [mm]: positive inside, finite and smooth outside.
+        """Return the signed distance (...) [mm] of d (..., 3) [mm] to the bound: positive inside, finite outside.
 
         Args:
-            d: Jaw parameters [mm], shape (..., 3).
-            bound: "slices", the joint bound of all three parameters, or "polygons", the paper's two outlines in
+            bound: "slices", the smooth joint bound of all three parameters, or "polygons", the paper's two outlines in
                 (d1, d2) and (d1, d3), whose margin is continuous but not smooth.
-
-        Returns:
-            Margins [mm], shape (...); a float for one d.
         """
         if bound != "slices":
             rows, batch = as_rows(d, (3,), "d")
@@ -59,10 +55,7 @@ class RigJudging(RigClearance, RigArrays):
         return _scalar_or_array(self.kernels.margins(rows).reshape(batch))
 
     def is_inside(self, d: ArrayLike, *, bound: BoundName = "slices") -> Mask:
-        """Return whether jaw parameters d (..., 3) [mm] lie inside the bound, i.e. have a margin of 0 or more.
-
-        The bound itself counts as inside, up to rounding of 1e-6 mm. The tolerance of measured poses does not apply.
-        """
+        """Return whether jaw parameters d (..., 3) [mm] have a margin of 0 or more, up to rounding of 1e-6 mm."""
         return is_inside(self.margin(d, bound=bound))
 
     def _polygons(self, bound: BoundName) -> PolygonBound:
@@ -80,19 +73,15 @@ class RigJudging(RigClearance, RigArrays):
         times_s: ArrayLike | None = None,
         speed_limit_mm_s: float | None = None,
     ) -> Verdicts:
-        """Judge measured poses by rigidity, distance to the model, margin to the bound, collisions and speed.
+        """Judge measured poses (..., 4, 4) by rigidity, distance to the model, margin to the bound, collisions, speed.
 
         Args:
-            T_skull_mandible: Poses, shape (..., 4, 4).
             residual_limit_mm: Largest landmark distance to the model; default: the rig's own limit.
             tolerance_mm: How far outside the bound a measured pose may lie; default: the rig's own tolerance. With 0
                 the poses are judged as authored: teeth may then penetrate less deeply than in measured poses.
             bound: "slices" or "polygons"; see `margin`.
             times_s: Times of the poses along the last batch axis, shape (F,); required with a speed limit.
             speed_limit_mm_s: Largest speed of a landmark since the last valid pose; None disables the check.
-
-        Returns:
-            Verdicts of the batch shape.
 
         Raises:
             ValueError: wrong shapes, a negative tolerance, or a speed limit without increasing times.
@@ -150,9 +139,7 @@ class RigJudging(RigClearance, RigArrays):
         bound: BoundName = "slices",
         speed_limit_mm_s: float | None = None,
     ) -> VerdictStream:
-        """Return an object that judges poses one at a time as `validate` judges them together.
-
-        The arguments are those of `validate`.
+        """Return an object that judges poses one at a time as `validate`, with its arguments, judges them together.
 
         Raises:
             ValueError: a negative tolerance, or an unknown bound.
@@ -180,10 +167,8 @@ class GoodPose(NamedTuple):
 class VerdictStream:
     """Judge the poses of a stream one at a time; see `JawRig.verdicts`.
 
-    Speeds are measured from the last valid pose, so that one wrong pose does not make the next one invalid.
-
-    Attributes:
-        last_good: The last valid pose; None before the first one.
+    Speeds are measured from the last valid pose, `last_good` (None before the first one), so that one wrong pose does
+    not make the next one invalid.
     """
 
     def __init__(self, judge: Callable[[Array], Verdicts], landmarks: Array, speed_limit_mm_s: float | None) -> None:

@@ -75,10 +75,7 @@ class NumpyKernels:
         return -in_chunks(lambda d: self._bound.signed_distance_gradient(d)[1], usable_rows(d))
 
     def encode(self, T: Array) -> tuple[Array, Array]:
-        """Return the d (n, 3) [mm] nearest to poses T_skull_mandible (n, 4, 4), and the residuals (n,) [mm].
-
-        Matrices that are not rigid to `RIGID_TOLERANCE` give NaN.
-        """
+        """Return the d (n, 3) [mm] nearest to poses (n, 4, 4), and the residuals (n,) [mm]; NaN where not rigid."""
         T = usable_rows(T)
         known = np.isfinite(T[:, :1, :1])
         rigid = known[:, 0, 0] & (in_chunks(rigidity_defect, np.where(known, T, np.eye(4))) <= RIGID_TOLERANCE)
@@ -125,15 +122,12 @@ class NumpyKernels:
         return self._bottom(residual, start)
 
     def solve_ik(self, handles: Handles, targets: Array, start: Array) -> tuple[Array, Array]:
-        """Search inside the bound for the parameters that move handles nearest to their targets.
+        """Return d (n, 3) [mm] inside the bound that move handles nearest to targets, and squared distances (n,).
 
         Args:
             handles: The m points of the mandible.
             targets: Their target positions, anatomical frame [mm], scaled by the weights of the handles, (n, 3, m).
-            start: Initial d [mm] inside the bound, shape (n, 3).
-
-        Returns:
-            The local minima (n, 3) [mm] around the starts, and the remaining squared distances (n,).
+            start: Initial d [mm] inside the bound, shape (n, 3); the results are the local minima around them.
         """
         if len(start) == 1:
             residual = distance_residual(self._model.decode_derivative, handles, targets)

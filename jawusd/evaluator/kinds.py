@@ -126,19 +126,12 @@ class JawFormula(Protocol):
     ) -> RigidMotion[N]:
         """Return the motion away from the closed bite, anatomical frame, at the jaw parameters d [mm].
 
-        Args:
-            d: Jaw parameters [mm].
-            tables: The formula's tables in the form of the number type.
-            ops: Operations of the number type.
-            numbers: The formula's scalars in the number type; default: its own floats.
+        `tables` and `numbers` are those of the formula in the form of the number type; without numbers, its own floats.
         """
 
 
 class AnchoredNumbers(NamedTuple):
-    """The scalars of an anchored model (see `AnchoredModel`); `linear` has 3 inputs times 3 outputs [rad].
-
-    `spread` is the result of `spread_of`.
-    """
+    """The scalars of an anchored model (see `AnchoredModel`)."""
 
     gauge: GaugeNumbers
     incisor: Triple[float]

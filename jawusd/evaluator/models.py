@@ -249,10 +249,7 @@ class AnchoredModel(JawModelForm):
 
 @dataclass(frozen=True)
 class AdditiveModel(JawModelForm):
-    """A sum of three curves in se(3): ``log M(d) = Phi1(d1) + Phi2(d2) + Phi3(d3)`` (Yang et al. 2019, eq. 5).
-
-    The sum is zero at d = 0: the constant that the curves have in common is included only once.
-    """
+    """A sum of three curves in se(3), 0 at d = 0: ``log M(d) = Phi1(d1) + Phi2(d2) + Phi3(d3)`` (Yang 2019, eq. 5)."""
 
     kind: ClassVar[str] = ADDITIVE
     #: the three curves of twists, about the origin of the anatomical frame

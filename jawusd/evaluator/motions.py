@@ -1,11 +1,8 @@
 """Rigid motions of the mandible, for batches and for one pose in plain floats, and the frames of a rig.
 
-Evaluating one pose with the array functions spends nearly all its time on the call overhead of numpy. DCC callbacks and
-face solvers evaluate single poses, so the models of `jawusd.evaluator.models` have a second implementation in floats;
-tests compare the two.
-
-A motion (R, t) in floats consists of twelve numbers: the rows of ``R - I``, then the displacement [mm] of a point p,
-the anchor: ``u = R p + t - p``.
+Single poses, which DCC callbacks and face solvers need, have a second implementation in floats, without the call
+overhead of numpy; tests compare the two. A motion (R, t) in floats consists of twelve numbers: the rows of ``R - I``,
+then the displacement [mm] of a point p, the anchor: ``u = R p + t - p``.
 """
 
 from __future__ import annotations
@@ -36,13 +33,7 @@ def motions_from_twists(twists: Array) -> Array:
 
 
 def anchored_motions(omega: Array, moved: Array, anchor: Array) -> Array:
-    """Return the motions (n, 4, 4) that rotate by omega (n, 3) [rad] and move an anchor point to given positions.
-
-    Args:
-        omega: Rotation vectors [rad], shape (n, 3).
-        moved: Positions of the anchor after the motion [mm], shape (n, 3).
-        anchor: The anchor point [mm], shape (3,).
-    """
+    """Return the motions (n, 4, 4) that rotate by omega (n, 3) [rad] and move an anchor (3,) to `moved` (n, 3) [mm]."""
     wx, wy, wz = omega.T
     a, b, _ = batched_angle_coefficients(dot((wx, wy, wz), (wx, wy, wz)))
     M = _with_rotation((wx, wy, wz), a, b)
@@ -74,16 +65,7 @@ class SingleForm(Protocol):
 
 
 class SingleAnchored:
-    """A `models.AnchoredModel` for one finite d or u; the anchor is the incisal point.
-
-    Args:
-        gauge: Map between d and u.
-        incisor: The incisal point at rest [mm], shape (3,).
-        scales: Lengths dividing the sheared displacement [mm], shape (3,).
-        centres: Spline centres, shape (m, 3).
-        weights: Weights of the m kernels and the 3 linear terms [rad], shape (m + 3, 3).
-        offset: Value of the spline itself at u = 0 [rad], shape (3,).
-    """
+    """A `models.AnchoredModel`, given its arrays, for one finite d or u; the anchor is the incisal point."""
 
     def __init__(
         self, gauge: GaugeNumbers, incisor: Array, scales: Array, centres: Array, weights: Array, offset: Array
@@ -207,14 +189,7 @@ def _motion(omega: Vector, u: Vector) -> Motion:
 class RigFrames:
     """The coordinate frames of a rig: for a motion M, ``T_skull_mandible = A^-1 M T_anatomical_mandible_rest``.
 
-    Here A is T_anatomical_skull.
-
-    Attributes:
-        T_anatomical_skull: Shape (4, 4).
-        T_skull_anatomical: Its inverse.
-        T_anatomical_mandible_rest: Mandible to anatomical coordinates with the teeth together, shape (4, 4).
-        T_mandible_anatomical_rest: Its inverse.
-        adjoint: Ad(T_skull_anatomical), twists from the anatomical to the skull frame, shape (6, 6).
+    Here A is T_anatomical_skull (4, 4). `adjoint` (6, 6) is Ad(A^-1), which maps twists to the skull frame.
     """
 
     def __init__(self, T_anatomical_skull: Array, T_rest: Array, anchor: Vector) -> None:

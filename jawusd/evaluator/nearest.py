@@ -1,8 +1,5 @@
 """The search of `jawusd.evaluator.solver` for one problem in floats: faster, and part of the single-file reader.
 
-In the search for the nearest point, a step first uses the full Hessian of the bound, and if that fails, only its
-positive semidefinite part.
-
 This file imports only the standard library, `curve_formula`, `formula` and `operations`: it is copied into the reader,
 which runs in Python 3.9. Symmetric matrices are six numbers: xx, xy, xz, yy, yz, zz.
 """
@@ -97,13 +94,12 @@ def nearest_in_valley(bound: BoundFormula, wanted: Vector, start: Vector) -> Vec
 def lowest_in_valley(
     bound: BoundFormula, pull: Callable[[Vector], Pull], start: Vector, *, exact: bool = False
 ) -> Vector:
-    """Return the minimiser of a cost inside the bound, in the basin of a valid start [mm].
+    """Return the minimiser of a cost inside the bound, in the basin of a valid start [mm]; NaN for NaN.
 
     Args:
-        bound: The bound.
         pull: Function that returns the cost and its quadratic model at a point.
-        start: The start; if it or its cost is not finite, the result is NaN.
-        exact: Whether the quadratic model is exact, so that steps benefit from the full Hessian of the bound.
+        exact: Whether the quadratic model is exact. Steps then first use the full Hessian of the bound and, if that
+            fails, only its positive semidefinite part.
     """
     if not math.isfinite(sum(start)):
         return _UNKNOWN
@@ -131,10 +127,7 @@ def lowest_in_valley(
 def pulled_in(bound: BoundFormula, x: Vector, *, opening: float = 1.0) -> tuple[Vector, Place]:
     """Return a point [mm] moved along the gradient until just inside, and the bound to second order there.
 
-    Args:
-        bound: The bound.
-        x: The point.
-        opening: Factor on the d1 component of the gradient; with 0 the point keeps its opening.
+    `opening` is a factor on the d1 component of the gradient; with 0 the point keeps its opening.
     """
     at = place(bound, x)
     for _ in range(PULL_BACKS):

@@ -1,8 +1,8 @@
 """The operations that formulas need beyond arithmetic, and their implementation for Python floats.
 
-A table consists of rows of floats, stored in a form that depends on the number type. A column of a table is a sequence
-of numbers, or a sequence with a single element that is an array of them, such as a tensor. This file imports only the
-standard library and `jawusd.geometry.rodrigues`: it is copied into the single-file reader.
+A table consists of rows of floats, stored in a form that depends on the number type; a column is a sequence of numbers,
+or of one array of them, such as a tensor. This file imports only the standard library and `jawusd.geometry.rodrigues`:
+it is copied into the single-file reader.
 """
 
 from __future__ import annotations

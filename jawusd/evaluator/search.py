@@ -69,11 +69,7 @@ class BoundedSearch:
         return valid
 
     def solve_ik_multistart(self, handles: Handles, target: Array) -> Array:
-        """Return the valid d (n, 3) [mm] that move the handles nearest to the targets (n, 3, m).
-
-        Args:
-            handles: The m points of the mandible.
-            target: Their target positions, anatomical frame [mm], scaled by the weights of the handles.
+        """Return the valid d (n, 3) [mm] that move handles nearest to targets (n, 3, m) scaled by their weights.
 
         Raises:
             EvaluatorError: the valid volume is empty.
@@ -81,10 +77,10 @@ class BoundedSearch:
         return self._multistart(handles, target)[0]
 
     def solve_ik(self, handles: Handles, target: Array, start: Array) -> Array:
-        """Return the local minima in whose basins the starts (n, 3) [mm] lie.
+        """Return the local minima in whose basins the starts (n, 3) [mm] lie, which makes dragging continuous.
 
-        Short steps keep the search in that basin, which makes dragging continuous. A result far from its start is not
-        part of a drag; the result of `solve_ik_multistart` replaces it if that one is better.
+        A result far from its start is not part of a drag; the result of `solve_ik_multistart` replaces it if that one
+        is better.
         """
         found, left = self._kernels.solve_ik(handles, target, start)
         far = np.flatnonzero(np.linalg.norm(found - start, axis=1) > _MAX_DRAG_MM)
@@ -118,13 +114,7 @@ class BoundedSearch:
         return np.array([[step * spacing_mm, 0.0, 0.0] for step in _RIPPLE_STEPS])
 
     def _best(self, search: Search, features: Array, wanted: Array) -> tuple[Array, Array]:
-        """Return the best d (n, 3) [mm] of the searches started in all valleys, and the squared residuals (n,).
-
-        Args:
-            search: Maps starts to minima.
-            features: Features of the scanned points, shape (p, k).
-            wanted: Their wanted values, shape (n, k).
-        """
+        """Return the best d (n, 3) [mm] of searches in all valleys of features (p, k), and squared residuals (n,)."""
         best, least = np.full((len(wanted), 3), np.nan), np.full(len(wanted), np.inf)
         rows, starts = self._scan.valleys(features, wanted)
         found, cost = search(rows, starts)
@@ -135,11 +125,7 @@ class BoundedSearch:
 
 
 class _Scan:
-    """Points spread over the valid volume, slice by slice, and the rigid motion at each.
-
-    Attributes:
-        points: d of the points [mm], shape (p, 3), in order of d1.
-    """
+    """Points d (p, 3) [mm] spread over the valid volume, by slices in order of d1, and the rigid motion at each."""
 
     def __init__(self, points: Array, R: Array, t: Array) -> None:
         """Store the points and the rigid motion at each: R (p, 3, 3), t (p, 3) [mm]."""
@@ -152,13 +138,10 @@ class _Scan:
         return (self._motions @ vectors).reshape(len(self.points), 3, vectors.shape[1])
 
     def valleys(self, features: Array, wanted: Array) -> tuple[Indices, Array]:
-        """Return starting points: row indices (m,), with repeats, and d (m, 3) [mm]; rows with NaN have none.
+        """Return starting points for wanted features (n, k): row indices (m,), with repeats, and d (m, 3) [mm].
 
-        A valley is a slice whose best point is at least as good as those of both neighbouring slices.
-
-        Args:
-            features: Features of the points, shape (p, k).
-            wanted: Their wanted values, shape (n, k).
+        A valley is a slice whose best point, by its features (p, k), is at least as good as those of both neighbouring
+        slices; rows with NaN have none.
         """
         found = np.full((len(wanted), _MAX_VALLEYS), -1, dtype=np.intp)
         squared = self._lengths if features is self.points else _squared_lengths(features)

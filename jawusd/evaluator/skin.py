@@ -99,10 +99,7 @@ class Skin:
         self._weights = self._precision @ (self.arrays["d"] - self._d_mean)
 
     def __call__(self, X: ArrayLike) -> SkinJaw:
-        """Return the jaw parameters of faces.
-
-        Args:
-            X: The columns with which the map was learned, shape (..., K), or points [mm], shape (..., N, 3).
+        """Return the jaw parameters of faces, given as the learned columns (..., K) or as points (..., N, 3) [mm].
 
         Raises:
             ValueError: the number of columns is not K.

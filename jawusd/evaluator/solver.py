@@ -48,16 +48,9 @@ class Bound(Protocol):
 
 
 def minimise(residual: Residual, start: Array, bound: Bound | None = None) -> Array:
-    """Minimise half the squared residual of every row.
+    """Return points (n, 3) [mm] that minimise half the squared residual of every row; NaN for a NaN start or residual.
 
-    Args:
-        residual: Residuals and their derivatives at given points of given rows.
-        start: Initial points [mm], shape (n, 3), inside the bound if given. Rows with a NaN start or residual become
-            NaN.
-        bound: The bound that points must stay inside.
-
-    Returns:
-        The points [mm], shape (n, 3).
+    `start` (n, 3) [mm] must lie inside the bound, if there is one, and points stay inside it.
     """
     x = start.copy()
     cost = np.full(len(x), np.nan)
@@ -107,11 +100,7 @@ def _picked(selected: Mask, *arrays: Array) -> tuple[Array, ...]:
 
 
 def solve_symmetric(A: Array, b: Array) -> Array:
-    """Solve A x = b for symmetric A (n, 3, 3) and b (n, 3) by cofactors.
-
-    Returns:
-        x, shape (n, 3).
-    """
+    """Return the solution (n, 3) of A x = b for symmetric A (n, 3, 3) and b (n, 3), by cofactors."""
     if len(A) == 1:
         (a, p, q), (_, c, s), (_, _, f) = A[0].tolist()
         x, y, z = b[0].tolist()

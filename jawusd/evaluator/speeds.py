@@ -31,12 +31,8 @@ class Speeds:
     def of_take(cls, d: ArrayLike, fps: float) -> Speeds:
         """Estimate the speeds of a take, corrected for noise that is independent between frames.
 
-        The noise level is estimated from the median of fourth differences, where noise dominates motion. Its
-        contribution to first and second differences is subtracted.
-
-        Args:
-            d: Jaw parameters [mm] of consecutive frames, shape (F, 3), from `solve` or `encode`; NaN if lost.
-            fps: Frames per second.
+        The noise level is estimated from the median of fourth differences, where noise dominates motion; `d` (F, 3)
+        [mm] are consecutive frames, NaN if lost.
 
         Raises:
             ValueError: a wrong shape, a rate that is not positive, or too few consecutive frames.

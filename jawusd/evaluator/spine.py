@@ -80,10 +80,10 @@ def _moved_inside(bound: SliceHull, d1: Array, start: Array, aim: Array, depth: 
 
 
 def moved_to_spine(bound: SliceHull, spine: Spine, d: Array, least_mm: float = 0.0) -> Array:
-    """Return d (n, 3) [mm], with rows of a margin below `least_mm` moved towards the spine.
+    """Return d (n, 3) [mm], with rows of a margin below `least_mm` moved towards the spine, continuously in d.
 
-    A continuous function of d: first d2 and d3 move towards the spine at that opening, then an opening beyond the ends
-    of the spine moves towards them.
+    First d2 and d3 move towards the spine at that opening, then an opening beyond the ends of the spine moves towards
+    them.
     """
     out = np.flatnonzero(distances(bound, d) > -least_mm)
     found = d.copy()
@@ -106,10 +106,7 @@ def moved_to_spine(bound: SliceHull, spine: Spine, d: Array, least_mm: float = 0
 
 
 def _entry(bound: SliceHull, start: Array, offset: Array, depth: float) -> Array:
-    """Return the largest fractions (n,) of offsets (n, 3) from points inside that keep a depth of ``depth`` [mm].
-
-    Newton from the far end: the signed distance is convex along a line across a section, so no step overshoots.
-    """
+    """Return the largest fractions (n,) of offsets (n, 3) from points inside that keep a depth [mm], by Newton."""
     share = np.ones(len(start))
     active = np.arange(len(start))
     for _ in range(_NEWTON):

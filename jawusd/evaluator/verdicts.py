@@ -109,12 +109,7 @@ def is_inside(margin_mm: ArrayLike) -> Mask:
 
 
 def place(margin_mm: float, tolerance_mm: float = 0.0) -> str:
-    """Return the location of parameters in words: "inside", "within tolerance 0.83 of 1.00 mm" or "outside".
-
-    Args:
-        margin_mm: Their margin.
-        tolerance_mm: Maximum distance of valid parameters outside the bound; 0 for authored ones.
-    """
+    """Return the location of parameters in words: "inside", "within tolerance 0.83 of 1.00 mm" or "outside"."""
     if is_inside(margin_mm):
         return INSIDE
     if margin_mm >= -tolerance_mm - ON_BOUND_MM:
@@ -176,20 +171,15 @@ def exceeds(moved_mm: Array, elapsed_s: ArrayLike, limit_mm_s: float) -> Mask:
 
 
 def too_fast(positions: Array, valid: Mask, times_s: ArrayLike | None, limit_mm_s: float) -> Mask:
-    """Return which frames were reached too fast from the last good one.
+    """Return which frames (..., F) were reached too fast from the last good one: valid and not reached too fast.
 
-    A frame is good if it is valid and was not reached too fast. Measuring from the last good frame, not from the frame
-    before, keeps one wrong frame from making the next one invalid. After a lasting jump, frames are too fast until the
-    time since the last good frame suffices for the jump.
+    Measuring from the last good frame, not from the frame before, keeps one wrong frame from making the next one
+    invalid. After a lasting jump, frames are too fast until the time since the last good frame suffices for the jump.
 
     Args:
         positions: Landmark positions [mm], shape (..., F, L, 3); NaN where there is no pose.
         valid: Which frames are valid apart from their speed, shape (..., F).
         times_s: Increasing times, shape (F,).
-        limit_mm_s: Largest speed [mm/s].
-
-    Returns:
-        Mask, shape (..., F). Frames up to and including the first good one are never too fast.
 
     Raises:
         ValueError: there is no frame axis, or the times do not match it or do not increase.
