@@ -18,37 +18,13 @@ from jawusd.evaluator.arrays import RigArrays
 from jawusd.evaluator.batching import as_floats, as_keys, as_rows, in_chunks, pairs_in_chunks
 from jawusd.evaluator.bounds import Ranges, SliceHull, denormalized, normalized
 from jawusd.evaluator.clamping import Inside, kept_inside
-from jawusd.evaluator.curves import HermiteCurve
+from jawusd.evaluator.curves import HermiteCurve, interpolate_linear
 from jawusd.evaluator.search import nearest_distance
 
 _SAMPLES = 129  # number of samples of a segment that is clamped to the bound
 # Fractions of a segment at which it is checked against the bound, dense at its ends, since keys may lie on the bound.
 _CHECK_SHARES = 0.5 - 0.5 * np.cos(np.linspace(0.0, np.pi, 1025))
 _ROUNDING_MM = 1e-9
-
-
-def interpolated(
-    frames: Array, keys: Array, at: Array, method: str, bound: SliceHull | None, tangents: Array | None = None
-) -> Array:
-    """Return d (m, 3) [mm] at times ``at`` between keys (k, 3), "linear" or "smooth"; constant outside the keys.
-
-    Args:
-        tangents: See `smooth_tangents`; lines do not use them.
-        bound: Smooth segments between two valid keys that would leave this bound follow it instead.
-
-    Raises:
-        ValueError: an unknown method.
-    """
-    if method == "linear":
-        return interpolate_linear(frames, keys, at)
-    if method == "smooth":
-        return interpolate_smooth(frames, keys, at, bound, tangents)
-    raise ValueError(f'method must be "linear" or "smooth", got {method!r}')
-
-
-def interpolate_linear(frames: Array, keys: Array, at: Array) -> Array:
-    """Return d (m, 3) [mm] at times ``at`` on straight lines between keys (k, 3); constant outside the keys."""
-    return np.stack([np.interp(at, frames, column) for column in keys.T], axis=1)
 
 
 def interpolate_smooth(
@@ -81,23 +57,17 @@ def interpolate_smooth(
 
 def smooth_tangents(frames: Array, keys: Array, given: Array | None = None) -> Array:
     """Return the tangents (k, 3) [mm per frame] of the smooth curve: those given, monotone ones where these are NaN."""
-    monotone = monotone_tangents(frames, keys)
-    return monotone if given is None else np.where(np.isnan(given), monotone, given)
-
-
-def monotone_tangents(frames: Array, keys: Array) -> Array:
-    """Return the tangents (k, 3) [mm per frame] of the smooth curve at the keys (k, 3) [mm]: zero at both ends."""
     step = np.diff(frames)[:, None]
     slope = np.diff(keys, axis=0) / step
     before, after = slope[:-1], slope[1:]
     weight_before, weight_after = 2 * step[1:] + step[:-1], step[1:] + 2 * step[:-1]
-    tangents = np.zeros_like(keys)
+    monotone = np.zeros_like(keys)
     onward = before * after > 0
-    np.divide(weight_before, before, out=tangents[1:-1], where=onward)
+    np.divide(weight_before, before, out=monotone[1:-1], where=onward)
     rest = np.divide(weight_after, after, out=np.zeros_like(before), where=onward)
-    total = tangents[1:-1] + rest
-    tangents[1:-1] = np.divide(weight_before + weight_after, total, out=np.zeros_like(before), where=onward)
-    return tangents
+    total = monotone[1:-1] + rest
+    monotone[1:-1] = np.divide(weight_before + weight_after, total, out=np.zeros_like(before), where=onward)
+    return monotone if given is None else np.where(np.isnan(given), monotone, given)
 
 
 class RigAuthoring(RigArrays):
@@ -136,7 +106,12 @@ class RigAuthoring(RigArrays):
         slopes = None if tangents is None else np.array(tangents, dtype=np.float64)
         if slopes is not None and (slopes.shape != keys.shape or np.isinf(slopes).any()):
             raise ValueError(f"tangents must have shape {keys.shape} and no infinite entry, got shape {slopes.shape}")
-        d = interpolated(frames, keys, times[:, 0], method, self.bound if inside else None, slopes)
+        if method == "linear":
+            d = interpolate_linear(frames, keys, times[:, 0])
+        elif method == "smooth":
+            d = interpolate_smooth(frames, keys, times[:, 0], self.bound if inside else None, slopes)
+        else:
+            raise ValueError(f'method must be "linear" or "smooth", got {method!r}')
         return d.reshape(*batch, 3)
 
     def keep_inside(self, times: ArrayLike, d: ArrayLike) -> Inside:

@@ -13,6 +13,7 @@ import numpy as np
 
 from jawusd.base.arrays import Array, Indices, Mask
 from jawusd.evaluator.bounds import SliceHull
+from jawusd.evaluator.curves import interpolate_linear
 from jawusd.evaluator.spine import INSET_MM, Spine, distances, moved_to_spine
 
 MAX_STRETCH = 1.045  # maximum factor by which a step may grow: 5 %, less an allowance for rounding
@@ -192,7 +193,7 @@ def lengths(path: Array) -> Array:
 def along(path: Array, length: Array, at: Array) -> Array:
     """Return the points (m, 3) of a path (n, 3) at arc lengths ``at`` (m,), given its cumulative lengths (n,)."""
     keep = np.concatenate([[True], np.diff(length) > 0])
-    return np.stack([np.interp(at, length[keep], column[keep]) for column in path.T], axis=1)
+    return interpolate_linear(length[keep], path[keep], at)
 
 
 def short_enough(bound: SliceHull, path: Array, allowed: Array) -> Array:

@@ -63,6 +63,11 @@ class HermiteCurve:
 _REST_MM = 1e-6
 
 
+def interpolate_linear(knots: Array, values: Array, at: Array) -> Array:
+    """Return the points (*at.shape, k) on straight lines between values (n, k) at knots (n,); constant outside."""
+    return np.stack([np.interp(at, knots, column) for column in values.T], axis=-1)
+
+
 def flat_ended(knots: Array, values: Array) -> HermiteCurve:
     """Return the curve through values (n, k) at knots (n,) with Catmull-Rom slopes, flat at both ends."""
     slopes = np.zeros_like(values)

@@ -15,6 +15,7 @@ from jawusd.base.arrays import Array, Mask
 from jawusd.base.errors import EvaluatorError
 from jawusd.evaluator.batching import in_chunks, pairs_in_chunks
 from jawusd.evaluator.bounds import SliceHull, largest_share
+from jawusd.evaluator.curves import interpolate_linear
 
 INSET_MM = 0.01  # depth [mm] to which points are moved inside, so that lines between samples stay inside
 
@@ -60,7 +61,7 @@ class Spine:
     def at(self, d1: Array) -> tuple[Array, Array]:
         """Return the openings (n,) [mm] clipped to the spine, and its points there (n, 2) [mm]."""
         kept = np.clip(d1, self.d1[0], self.d1[-1])
-        return kept, np.stack([np.interp(kept, self.d1, column) for column in self.middle.T], axis=1)
+        return kept, interpolate_linear(self.d1, self.middle, kept)
 
 
 def distances(bound: SliceHull, d: Array) -> Array:

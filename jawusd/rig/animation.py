@@ -18,6 +18,7 @@ from pxr import Gf, Sdf, Ts
 from jawusd.base.arrays import Array, Mask
 from jawusd.base.errors import RigError
 from jawusd.evaluator import JawRig
+from jawusd.evaluator.curves import interpolate_linear
 from jawusd.geometry.se3 import make_transform
 from jawusd.geometry.so3 import so3_exp, wxyz_from_matrix
 from jawusd.rig import layers
@@ -144,12 +145,12 @@ def bake_times(rig: JawRig, frames: Array, d: Array, span: Array) -> tuple[Array
     """
     whole = np.arange(np.ceil(span[0]), np.floor(span[1]) + 1)
     times = np.union1d(np.union1d(whole, span), frames)
-    poses = rig.pose(_interpolated(times, frames, d))
+    poses = rig.pose(interpolate_linear(frames, d, times))
     for _ in range(_MAX_HALVINGS):
         start, step = times[:-1], np.diff(times)
         errors = []
         for share in _FRACTIONS:
-            exact = rig.pose(_interpolated(start + share * step, frames, d))
+            exact = rig.pose(interpolate_linear(frames, d, start + share * step))
             errors.append(landmark_distance(rig, exact, _as_shown_by_usd(poses[:-1], poses[1:], share)))
         coarse = np.max(errors, axis=0) > BETWEEN_MM
         if not coarse.any():
@@ -157,7 +158,7 @@ def bake_times(rig: JawRig, frames: Array, d: Array, span: Array) -> tuple[Array
         middles = (start + 0.5 * step)[coarse]
         where = np.flatnonzero(coarse) + 1
         times = np.insert(times, where, middles)
-        poses = np.insert(poses, where, rig.pose(_interpolated(middles, frames, d)), axis=0)
+        poses = np.insert(poses, where, rig.pose(interpolate_linear(frames, d, middles)), axis=0)
     return times, poses
 
 
@@ -192,10 +193,6 @@ def _set_samples(
 ) -> None:
     for time, value in zip(times.tolist(), values, strict=True):
         layer.SetTimeSample(attribute.path, time, value)
-
-
-def _interpolated(times: Array, frames: Array, d: Array) -> Array:
-    return np.stack([np.interp(times, frames, column) for column in d.T], axis=1)
 
 
 def _as_shown_by_usd(T_a: Array, T_b: Array, share: float) -> Array:
