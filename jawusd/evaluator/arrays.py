@@ -39,7 +39,18 @@ class HeldOut(NamedTuple):
 
 
 class RigArrays:
-    """The arrays of a rig by name (see `jawusd.evaluator.kinds`), read-only, and `meta`, the header of its file."""
+    """The arrays and the header of a rig."""
+
+    arrays: dict[str, Array]  # named arrays, read-only; `jawusd.evaluator.kinds` lists them
+    meta: dict[str, object]  # the header of the file
+    kind: str  # the kind of model, one of `jawusd.evaluator.kinds.KINDS`
+    T_anatomical_skull: Array  # transform from skull to anatomical axes (x left, y up, z anterior), shape (4, 4)
+    T_rest: Array  # T_skull_mandible of the closed bite, shape (4, 4)
+    landmarks: Array  # landmarks of the mandible [mm], mandible frame, shape (n, 3)
+    incisor: Array  # the lower incisal point at rest [mm], anatomical frame, shape (3,)
+    d_range: Array  # bounding box of the valid parameters [mm], rows (low, high), shape (3, 2)
+    captured_d: Array  # parameters of the captured poses [mm], shape (n, 3)
+    tolerance_mm: float  # maximum distance of a valid measured pose outside the bound; authored poses must lie inside
 
     def __init__(self, arrays: Mapping[str, ArrayLike], meta: Mapping[str, object]) -> None:
         """Check and store the arrays and the header.
@@ -47,18 +58,18 @@ class RigArrays:
         Raises:
             EvaluatorError: an unknown kind, or an array missing, of a wrong shape, not finite or out of range.
         """
-        self.meta = dict(meta)
-        self.arrays = checked_arrays(arrays, str(meta.get("kind")))
+        self.meta, self.kind = dict(meta), str(meta.get("kind"))
+        self.arrays = checked_arrays(arrays, self.kind)
+        self.T_anatomical_skull, self.T_rest = self.arrays["T_anatomical_skull"], self.arrays["T_rest"]
+        self.landmarks, self.incisor = self.arrays["landmarks"], self.arrays["incisor"]
+        self.d_range, self.captured_d = self.arrays["d_range"], self.arrays["codes"]
+        # + 0.0 avoids -0.0 for older files, which store the negated tolerance
+        self.tolerance_mm = float(self.arrays["tolerance_mm"]) + 0.0
 
     def __repr__(self) -> str:
         low, high = self.d_range.T
         ranges = ", ".join(f"d{i} {a:.1f} to {b:.1f}" for i, (a, b) in enumerate(zip(low, high), start=1))
         return f"<JawRig {self.actor or 'unnamed'}, {self.kind}, {ranges} mm>"
-
-    @property
-    def kind(self) -> str:
-        """The kind of model, one of `jawusd.evaluator.kinds.KINDS`."""
-        return str(self.meta["kind"])
 
     @property
     def actor(self) -> str:
@@ -77,21 +88,6 @@ class RigArrays:
         return tuple(str(each) for each in found) if isinstance(found, list | tuple) else ()
 
     @property
-    def T_anatomical_skull(self) -> Array:
-        """Transform from skull to anatomical coordinates (x left, y up, z anterior), shape (4, 4)."""
-        return self.arrays["T_anatomical_skull"]
-
-    @property
-    def T_rest(self) -> Array:
-        """T_skull_mandible of the closed bite, shape (4, 4)."""
-        return self.arrays["T_rest"]
-
-    @property
-    def landmarks(self) -> Array:
-        """Landmarks of the mandible [mm], mandible frame, shape (n, 3)."""
-        return self.arrays["landmarks"]
-
-    @property
     def error_growth(self) -> Array:
         """Error of the model at its landmarks, from held-out frames, shape (n, 2); 0 if unknown.
 
@@ -105,22 +101,6 @@ class RigArrays:
         return np.array(
             [[float(x) if isinstance(x, int | float) and 0 < x < _LARGEST else 0.0 for x in r] for r in found]
         )
-
-    @property
-    def incisor(self) -> Array:
-        """The lower incisal point at rest [mm], anatomical frame, shape (3,)."""
-        return self.arrays["incisor"]
-
-    @property
-    def d_range(self) -> Array:
-        """Bounding box of the valid parameters [mm], rows (low, high), shape (3, 2)."""
-        return self.arrays["d_range"]
-
-    @property
-    def tolerance_mm(self) -> float:
-        """Maximum distance [mm] of a valid measured pose outside the bound; authored poses must lie inside."""
-        # avoids -0.0 for older files, which store the negated tolerance
-        return float(self.arrays["tolerance_mm"]) + 0.0
 
     @property
     def held_out(self) -> HeldOut | None:
@@ -141,11 +121,6 @@ class RigArrays:
             digest.update(f"{name}{list(value.shape)}".encode())
             digest.update(np.ascontiguousarray(value, dtype="<f8").tobytes())
         return digest.hexdigest()
-
-    @property
-    def captured_d(self) -> Array:
-        """Parameters of the captured poses [mm], shape (n, 3)."""
-        return self.arrays["codes"]
 
 
 def checked_arrays(arrays: Mapping[str, ArrayLike], kind: str) -> dict[str, Array]:
