@@ -18,7 +18,6 @@ from numpy.typing import ArrayLike
 from jawusd.base.arrays import Array, Mask
 from jawusd.base.errors import EvaluatorError
 from jawusd.evaluator.batching import pairs_in_chunks, rows_of
-from jawusd.evaluator.verdicts import Verdicts
 
 #: Stored values are multiples of this length [mm].
 UNIT_MM = 0.01
@@ -188,15 +187,6 @@ class RigClearance:
             "this rig has no clearance data for the condyles.",
             hint="Fit or bake it with meshes of skull and mandible that include the joints.",
         )
-
-    def _without_collisions(self, verdicts: Verdicts, *, measured: bool) -> Verdicts:
-        """Return the verdicts with colliding poses marked invalid."""
-        if self.contact is None:
-            return verdicts
-        limit_mm = self.contact.limit_mm if measured else -AUTHORED_MM
-        if len(verdicts.d) == 1 and not self.contact.collides_at(verdicts.d, limit_mm):
-            return verdicts
-        return verdicts.with_collisions(self.contact.collides(verdicts.d, limit_mm))
 
 
 def check_contact(arrays: Mapping[str, Array], name: str) -> None:

@@ -12,7 +12,7 @@ from jawusd.base.arrays import Array, Mask
 from jawusd.evaluator.arrays import RigArrays
 from jawusd.evaluator.batching import as_floats, as_rows, in_chunks, rows_of
 from jawusd.evaluator.bounds import PolygonBound
-from jawusd.evaluator.contact import RigClearance
+from jawusd.evaluator.contact import AUTHORED_MM, RigClearance
 from jawusd.evaluator.kernels import NumpyKernels
 from jawusd.evaluator.verdicts import Limits, Reason, Verdicts, exceeds, is_inside, too_fast
 from jawusd.geometry.se3 import transform_points
@@ -22,11 +22,6 @@ BoundName = Literal["slices", "polygons"]
 SINGLE_LIMIT_MM = 1e4  # maximum |d|; beyond it, float functions may raise where array functions give infinities
 
 _scalar = cast("Callable[[float], Array]", np.float64)  # numpy's stubs do not treat scalars as arrays
-
-
-def _scalar_or_array(values: Array) -> Array:
-    """Return an array unchanged, but a 0-dimensional array as a number."""
-    return values[()]
 
 
 class RigJudging(RigClearance, RigArrays):
@@ -45,14 +40,16 @@ class RigJudging(RigClearance, RigArrays):
         """
         if bound != "slices":
             rows, batch = as_rows(d, (3,), "d")
-            return _scalar_or_array(-in_chunks(self._polygons(bound).signed_distance, rows).reshape(batch))
+            return -in_chunks(self._polygons(bound).signed_distance, rows).reshape(batch)[
+                ()
+            ]  # a number without batch axes
         d = as_floats(d, "d")
         if d.shape == (3,):
             d1, d2, d3 = d.tolist()
             if abs(d1) + abs(d2) + abs(d3) < SINGLE_LIMIT_MM:  # comparisons with NaN are false
                 return _scalar(self.kernels.margin(d1, d2, d3))
         rows, batch = rows_of(d, (3,), "d")
-        return _scalar_or_array(self.kernels.margins(rows).reshape(batch))
+        return self.kernels.margins(rows).reshape(batch)[()]  # a number without batch axes
 
     def is_inside(self, d: ArrayLike, *, bound: BoundName = "slices") -> Mask:
         """Return whether jaw parameters d (..., 3) [mm] have a margin of 0 or more, up to rounding of 1e-6 mm."""
@@ -88,10 +85,7 @@ class RigJudging(RigClearance, RigArrays):
         """
         rows, batch = rows_of(T_skull_mandible, (4, 4), "T_skull_mandible")
         limits = self.limits.replaced(residual_limit_mm, tolerance_mm, speed_limit_mm_s)
-        verdicts = self.kernels.judge_poses(rows, limits)
-        if bound != "slices":
-            verdicts = verdicts.with_margin(self.margin(verdicts.d, bound=bound), limits)
-        verdicts = self._without_collisions(verdicts, measured=tolerance_mm != 0)
+        verdicts = self._judged(self.kernels.judge_poses(rows, limits), limits, bound, measured=tolerance_mm != 0)
         return self._with_speed(verdicts, rows, batch, times_s, limits)
 
     def validate_parameters(
@@ -113,12 +107,20 @@ class RigJudging(RigClearance, RigArrays):
         """
         rows, batch = rows_of(d, (3,), "d")
         limits = self.limits.replaced(None, tolerance_mm, speed_limit_mm_s)
-        verdicts = self.kernels.judge_parameters(rows, limits)
-        if bound != "slices":
-            verdicts = verdicts.with_margin(self.margin(verdicts.d, bound=bound), limits)
-        verdicts = self._without_collisions(verdicts, measured=tolerance_mm != 0)
+        verdicts = self._judged(self.kernels.judge_parameters(rows, limits), limits, bound, measured=tolerance_mm != 0)
         poses = rows if speed_limit_mm_s is None else self.kernels.poses(rows)
         return self._with_speed(verdicts, poses, batch, times_s, limits)
+
+    def _judged(self, verdicts: Verdicts, limits: Limits, bound: BoundName, *, measured: bool) -> Verdicts:
+        """Return the verdicts for a bound, with colliding poses marked invalid."""
+        if bound != "slices":
+            verdicts = verdicts.with_margin(self.margin(verdicts.d, bound=bound), limits)
+        if self.contact is None:
+            return verdicts
+        limit_mm = self.contact.limit_mm if measured else -AUTHORED_MM
+        if len(verdicts.d) == 1 and not self.contact.collides_at(verdicts.d, limit_mm):
+            return verdicts
+        return verdicts.with_collisions(self.contact.collides(verdicts.d, limit_mm))
 
     def _with_speed(
         self, verdicts: Verdicts, poses: Array, batch: tuple[int, ...], times_s: ArrayLike | None, limits: Limits

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from jawusd.base.arrays import Array, Indices
+from jawusd.base.arrays import Array, Indices, Mask
 from jawusd.evaluator.batching import in_chunks, pairs_in_chunks, usable_rows
 from jawusd.evaluator.bounds import SliceHull
 from jawusd.evaluator.encoding import Encoder, Handles, distance_residual, landmark_vectors
@@ -77,9 +77,7 @@ class NumpyKernels:
     def encode(self, T: Array) -> tuple[Array, Array]:
         """Return the d (n, 3) [mm] nearest to poses (n, 4, 4), and the residuals (n,) [mm]; NaN where not rigid."""
         T = usable_rows(T)
-        known = np.isfinite(T[:, :1, :1])
-        rigid = known[:, 0, 0] & (in_chunks(rigidity_defect, np.where(known, T, np.eye(4))) <= RIGID_TOLERANCE)
-        return self.nearest(np.where(rigid[:, None, None], T, np.nan))
+        return self.nearest(np.where(_rigid(T)[:, None, None], T, np.nan))
 
     def nearest(self, T: Array) -> tuple[Array, Array]:
         """Return the d (n, 3) [mm] of the poses nearest to T (n, 4, 4), and the residuals (n,) [mm]; NaN for NaN."""
@@ -88,9 +86,8 @@ class NumpyKernels:
     def judge_poses(self, T: Array, limits: Limits) -> Verdicts:
         """Return verdicts on poses T_skull_mandible (n, 4, 4); the speed limit is ignored."""
         T = usable_rows(T)
-        finite = np.asarray(np.isfinite(T).all(axis=(1, 2)))
-        rigid = in_chunks(rigidity_defect, np.where(finite[:, None, None], T, np.eye(4))) <= RIGID_TOLERANCE
-        d, residual_mm = self.nearest(np.where((finite & rigid)[:, None, None], T, np.nan))
+        finite, rigid = np.isfinite(T[:, 0, 0]), _rigid(T)
+        d, residual_mm = self.nearest(np.where(rigid[:, None, None], T, np.nan))
         return judge(finite, rigid, residual_mm, self.margins(d), d, limits)
 
     def judge_parameters(self, d: Array, limits: Limits) -> Verdicts:
@@ -147,3 +144,9 @@ class NumpyKernels:
         found = minimise(residual, start, self._bound)
         r, _ = residual(found, np.arange(len(found)))
         return found, np.einsum("nm,nm->n", r, r)
+
+
+def _rigid(T: Array) -> Mask:
+    """Return which matrices (n, 4, 4), whole rows NaN if unusable, are rigid to `RIGID_TOLERANCE`."""
+    known = np.isfinite(T[:, :1, :1])
+    return known[:, 0, 0] & (in_chunks(rigidity_defect, np.where(known, T, np.eye(4))) <= RIGID_TOLERANCE)

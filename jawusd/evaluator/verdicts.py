@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntFlag
 from typing import NamedTuple
 
@@ -141,11 +141,8 @@ class Limits:
             return self
         if tolerance_mm is not None and not tolerance_mm >= 0:
             raise ValueError(f"tolerance_mm must be 0 or more, got {tolerance_mm}")
-        return Limits(
-            self.residual_mm if residual_mm is None else float(residual_mm),
-            self.tolerance_mm if tolerance_mm is None else float(tolerance_mm),
-            self.speed_mm_s if speed_mm_s is None else float(speed_mm_s),
-        )
+        given = {"residual_mm": residual_mm, "tolerance_mm": tolerance_mm, "speed_mm_s": speed_mm_s}
+        return replace(self, **{name: float(value) for name, value in given.items() if value is not None})
 
 
 def judge(finite: Mask, rigid: Mask, residual_mm: Array, margin_mm: Array, d: Array, limits: Limits) -> Verdicts:
