@@ -23,9 +23,8 @@ MIN_DAMPING = 1e-9
 INSIDE_MM = 1e-10  # Depth inside the bound of points that are moved back to its surface.
 MAX_STEP_MM = 1.0  # Maximum step length within a bound; a longer step may end in another basin.
 PULL_BACKS = 12  # maximum number of iterations that move a point back onto the surface
-PULL = (
-    1.01  # overshoot factor of the iterations that move a point back onto the surface, so that one iteration suffices
-)
+# overshoot factor of the iterations that move a point back onto the surface, so that one iteration suffices
+PULL = 1.01
 MIN_STIFFNESS = 1e-12  # minimum stiffness; keeps steps finite where the cost does not depend on a parameter
 # minimum squared gradient of the bound; keeps steps back onto the surface finite where the bound is flat
 MIN_SLOPE = 1e-6

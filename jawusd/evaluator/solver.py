@@ -8,11 +8,11 @@ the surface of the bound, and is accepted only if the cost does not increase.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Protocol
 
 import numpy as np
 
 from jawusd.base.arrays import Array, Indices, Mask
+from jawusd.evaluator.bounds import SliceHull
 from jawusd.evaluator.nearest import (
     INSIDE_MM,
     ITERATIONS,
@@ -34,20 +34,7 @@ Residual = Callable[[Array, Indices], tuple[Array, Array]]
 _IDENTITY = np.eye(3)
 
 
-class Bound(Protocol):
-    """A smooth bound, negative inside."""
-
-    def signed_distance(self, d: Array) -> Array:
-        """Return the signed distance (n,) [mm] at d (n, 3)."""
-
-    def signed_distance_gradient(self, d: Array) -> tuple[Array, Array]:
-        """Return signed distance (n,) and gradient (n, 3)."""
-
-    def signed_distance_curvature(self, d: Array) -> tuple[Array, Array, Array]:
-        """Return signed distance (n,), gradient (n, 3) and positive semidefinite curvature (n, 3, 3)."""
-
-
-def minimise(residual: Residual, start: Array, bound: Bound | None = None) -> Array:
+def minimise(residual: Residual, start: Array, bound: SliceHull | None = None) -> Array:
     """Return points (n, 3) [mm] that minimise half the squared residual of every row; NaN for a NaN start or residual.
 
     `start` (n, 3) [mm] must lie inside the bound, if there is one, and points stay inside it.
@@ -70,9 +57,8 @@ def minimise(residual: Residual, start: Array, bound: Bound | None = None) -> Ar
             step, multiplier = _bounded_step(bound, x[rows], r, J, damping, multiplier)
         moving = (np.abs(step) > TOLERANCE_MM).any(axis=1) & (damping < MAX_DAMPING)
         if bound is None:
-            x[rows] += np.where(
-                moving[:, None], 0.0, step
-            )  # the last step doubles the number of correct digits, so it needs no further evaluation
+            # the last step doubles the number of correct digits, so it needs no further evaluation
+            x[rows] += np.where(moving[:, None], 0.0, step)
         rows = rows[moving]
         r, J, damping, multiplier, step = _picked(moving, r, J, damping, multiplier, step)
         if not rows.size:
@@ -126,7 +112,7 @@ def _damped(A: Array, damping: Array) -> Array:
     return A + amount[:, None, None] * _IDENTITY
 
 
-def _first_multiplier(bound: Bound, x: Array, r: Array, J: Array) -> Array:
+def _first_multiplier(bound: SliceHull, x: Array, r: Array, J: Array) -> Array:
     """Return the bound's initial multiplier: computed from the cost gradient where x lies on the bound, otherwise 0."""
     distance, normal = bound.signed_distance_gradient(x)
     squared = np.maximum(np.einsum("ni,ni->n", normal, normal), MIN_SLOPE)
@@ -134,7 +120,9 @@ def _first_multiplier(bound: Bound, x: Array, r: Array, J: Array) -> Array:
     return np.where(distance > -TOUCHING_MM, np.maximum(press, 0.0), 0.0)
 
 
-def _bounded_step(bound: Bound, x: Array, r: Array, J: Array, damping: Array, multiplier: Array) -> tuple[Array, Array]:
+def _bounded_step(
+    bound: SliceHull, x: Array, r: Array, J: Array, damping: Array, multiplier: Array
+) -> tuple[Array, Array]:
     """Return the step of the quadratic model under the linearised bound, and the bound's multiplier."""
     distance, normal, curvature = bound.signed_distance_curvature(x)
     A = _damped(np.swapaxes(J, 1, 2) @ J + multiplier[:, None, None] * curvature, damping)
@@ -147,7 +135,7 @@ def _bounded_step(bound: Bound, x: Array, r: Array, J: Array, damping: Array, mu
     return step * np.minimum(1.0, MAX_STEP_MM / np.maximum(length, 1e-300))[:, None], multiplier
 
 
-def pulled_inside(bound: Bound, x: Array) -> tuple[Array, Mask]:
+def pulled_inside(bound: SliceHull, x: Array) -> tuple[Array, Mask]:
     """Move points x (n, 3) [mm] along the gradient until just inside, in place; return them and which succeeded."""
     inside = np.zeros(len(x), dtype=bool)
     rows: Indices = np.arange(len(x))
