@@ -146,7 +146,11 @@ class SingleTwist:
 
     def motion(self, d1: float, d2: float, d3: float) -> Motion:
         """Return M(d)."""
-        return motion_of_twist(*self._log(d1, d2, d3).tolist())
+        wx, wy, wz, vx, vy, vz = self._log(d1, d2, d3).tolist()
+        omega = wx, wy, wz
+        a, b, c = angle_coefficients(wx * wx + wy * wy + wz * wz)
+        x, y, z = turning(omega, a, b)
+        return *x, *y, *z, *apply_series(omega, (vx, vy, vz), b, c)
 
 
 class SingleCurve:
@@ -161,14 +165,6 @@ class SingleCurve:
         interval = bisect_right(self._knots, x)
         s = x - self._knots[max(interval - 1, 0)]
         return self._coefficients[interval].dot(np.array((1.0, s, s * s, s * s * s)))
-
-
-def motion_of_twist(wx: float, wy: float, wz: float, vx: float, vy: float, vz: float) -> Motion:
-    """Return the motion exp(omega, v) of a twist, omega = w [rad] and v [mm]."""
-    omega = wx, wy, wz
-    a, b, c = angle_coefficients(wx * wx + wy * wy + wz * wz)
-    x, y, z = turning(omega, a, b)
-    return *x, *y, *z, *apply_series(omega, (vx, vy, vz), b, c)
 
 
 def motion_matrix(motion: Motion, anchor: Vector = (0.0, 0.0, 0.0)) -> Array:

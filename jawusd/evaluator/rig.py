@@ -88,7 +88,7 @@ class JawRig(RigJudging, RigAuthoring):
 
     def __reduce__(self) -> tuple[object, ...]:
         arrays = {name: np.array(value) for name, value in self.arrays.items()}
-        return _rebuilt, (arrays, self.meta, self._make_kernels)
+        return partial(JawRig, kernels=self._make_kernels), (arrays, self.meta)
 
     def pose(self, d: ArrayLike) -> Array:
         """Return the poses T_skull_mandible (..., 4, 4) for jaw parameters d (..., 3) [mm]."""
@@ -273,12 +273,6 @@ class JawRig(RigJudging, RigAuthoring):
         left = held.across(vector_images(*self.model.decode(d), vectors) - scaled)
         distance_mm = np.sqrt(np.einsum("nij,nij->n", left, left))
         return IkResult(d.reshape(*batch, 3), distance_mm.reshape(batch))
-
-
-def _rebuilt(
-    arrays: Mapping[str, ArrayLike], meta: Mapping[str, object], kernels: Callable[[RigParts], NumpyKernels]
-) -> JawRig:
-    return JawRig(arrays, meta, kernels=kernels)
 
 
 def load(path: str | os.PathLike[str]) -> JawRig:

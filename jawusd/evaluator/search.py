@@ -172,16 +172,11 @@ def nearest_distance(points: Array, queries: Array) -> Array:
     """Return the distance (n,) of queries (n, 3) to the nearest of the points (p, 3); inf without points."""
     if not len(points):
         return np.where(np.isnan(queries[:, 0]), np.nan, np.inf)
-    return np.linalg.norm(queries - points[_nearest_rows(points, queries)], axis=1)
-
-
-def _nearest_rows(points: Array, queries: Array) -> Indices:
-    """Return the index of the nearest point (p, k) for each query (n, k); 0 for NaN."""
     squared = _squared_lengths(points)
-    found = np.zeros(len(queries), dtype=np.intp)
+    nearest = np.zeros(len(queries), dtype=np.intp)
     for i in range(0, len(queries), _SCAN_ROWS):
-        found[i : i + _SCAN_ROWS] = np.argmin(squared - 2.0 * queries[i : i + _SCAN_ROWS] @ points.T, axis=1)
-    return found
+        nearest[i : i + _SCAN_ROWS] = np.argmin(squared - 2.0 * queries[i : i + _SCAN_ROWS] @ points.T, axis=1)
+    return np.linalg.norm(queries - points[nearest], axis=1)
 
 
 def _squared_lengths(points: Array) -> Array:
