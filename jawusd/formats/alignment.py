@@ -179,10 +179,7 @@ class JawTrack:
 
 
 def read_jaw_track(path: str | os.PathLike[str], joint: tuple[float, float, float] | None) -> JawTrack:
-    """Read the jaw motion of a face model.
-
-    Args:
-        joint: jaw joint of the model [model units], if the file does not contain it.
+    """Read the jaw motion of a face model; `joint` [model units] is used if the file does not contain it.
 
     Raises:
         FormatError: the file has no jaw motion, an array has a wrong shape, or there is no joint.

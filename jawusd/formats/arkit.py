@@ -74,12 +74,11 @@ def shares_of(weights: Array) -> Array:
 
 
 def read_arkit(path: str | os.PathLike[str], fps: float | None = None) -> FaceCapture:
-    """Read a face capture of Live Link Face.
+    """Read a face capture (CSV) of Live Link Face.
 
     Args:
-        path: the CSV file.
-        fps: frame rate of the result [Hz]: the sample rate, the time code rate, or an integer multiple or fraction
-            of the time code rate. None uses the time code rate; the capture must then contain a full second.
+        fps: frame rate of the result [Hz]: the sample rate, the time code rate, or an integer multiple or fraction of
+            the time code rate. None uses the time code rate; the capture must then contain a full second.
 
     Raises:
         FormatError: the file is not such a table, a value is not finite, a time code does not increase, or the rate
@@ -183,13 +182,10 @@ def _seconds_and_frame(code: str, named: str, path: Path) -> tuple[int, float]:
 
 
 def _spread(codes: Array) -> Array:
-    """Return the frame number of each row within its second; rows that repeat a time code are spread evenly.
+    """Return the frame number of each row of codes (F, 2) (seconds, frames within the second) within its second.
 
-    Rows are spread only if most time codes are repeated. If a time code has fewer rows than usual, its last rows are
-    assumed to be missing, or its first rows if it begins the recording.
-
-    Args:
-        codes: seconds and frames within the second, shape (F, 2).
+    Rows that repeat a time code are spread evenly, if most time codes are repeated. If a time code has fewer rows than
+    usual, its last rows are assumed to be missing, or its first rows if it begins the recording.
     """
     first = np.flatnonzero(np.concatenate([[True], (np.diff(codes, axis=0) != 0).any(axis=1)]))
     counts = np.diff(np.append(first, len(codes)))

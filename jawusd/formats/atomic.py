@@ -243,12 +243,7 @@ def write_csv_atomic(
 
 
 def write_npz_atomic(path: str | os.PathLike[str], arrays: Mapping[str, ArrayLike], *, packed: bool = True) -> None:
-    """Write an npz file atomically; equal arrays give equal bytes.
-
-    Arrays are written in C order, which simple readers require.
-
-    Args:
-        packed: whether to compress the arrays.
+    """Write arrays in C order as an npz file, `packed` by compression, atomically; equal arrays give equal bytes.
 
     Raises:
         OutputError: the file cannot be written.

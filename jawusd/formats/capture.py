@@ -212,11 +212,7 @@ _MOST_LOOKED_AT = 4096  # number of leading bytes that are searched for null byt
 
 
 def _refuse_other_files(path: Path) -> None:
-    """Reject a path that cannot be a capture.toml, with a hint.
-
-    Raises:
-        FormatError: the file is missing, or not text.
-    """
+    """Raise FormatError, with a hint, for a path that cannot be a capture.toml: it is missing, or not text."""
     if not path.exists():
         hint = f"There is no folder {path.parent} either."
         if not path.is_absolute():
@@ -275,10 +271,7 @@ def load_capture(path: str | os.PathLike[str], *, allow_outside: bool = False) -
 def read_capture(
     path: str | os.PathLike[str], *, allow_outside: bool = False
 ) -> tuple[Capture | None, list[JawusdError]]:
-    """Read a capture like `load_capture`, but return all problems instead of raising the first.
-
-    The capture is None if values are missing or wrong. Paths of missing files are kept.
-    """
+    """Read a capture like `load_capture`, but return all problems instead of raising the first; None without values."""
     path = Path(path)
     if path.is_dir():
         path = path / "capture.toml"

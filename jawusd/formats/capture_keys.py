@@ -1,7 +1,4 @@
-"""Keys of capture.toml: reference, and validation errors that name table, key, value and allowed values.
-
-The reference and the errors are derived from the pydantic models that read the file.
-"""
+"""Keys of capture.toml: reference and validation errors, both derived from the pydantic models that read the file."""
 
 from __future__ import annotations
 
@@ -77,7 +74,6 @@ def entries(
     """Yield the keys of a model and of its nested tables, in file order.
 
     Args:
-        model: the model of the table.
         table: the table's header in the file.
         prefix: prefix of keys that are written in the table above, such as "masks.".
         skipped: fields that are not read from the file.
@@ -172,11 +168,7 @@ def reference_lines(listed: list[KeyEntry], width: int = 100) -> list[str]:
 def problems_of(
     error: ValidationError, model: type[BaseModel], data: Mapping[str, object]
 ) -> list[tuple[str, str | None]]:
-    """Return the validation problems, each as a sentence that names table and key, and a hint or None.
-
-    Args:
-        error: the error raised when `model` validated `data`, the content of the file.
-    """
+    """Return the problems of a model's validation of `data`: sentences that name table and key, and hints or None."""
     found = error.errors()
     unknown = [(problem["loc"][:-1], str(problem["loc"][-1])) for problem in found if _is_unknown(problem["type"])]
     deeper = {problem["loc"][:depth] for problem in found for depth in range(len(problem["loc"]))}

@@ -1,7 +1,4 @@
-"""Parts of a capture: scans, masks, cameras and calibration boards; and the paths in them.
-
-Paths that are missing or outside the capture's folder are reported.
-"""
+"""Parts of a capture: scans, masks, cameras and calibration boards; and the paths in them."""
 
 from __future__ import annotations
 
@@ -237,7 +234,6 @@ def resolve_paths(
     """Return a model with absolute paths, and an error for each path that is missing or outside the folder.
 
     Args:
-        model: a model that was read from a file.
         source: the file of the model; paths are relative to its folder.
         data: content of the file, for the names of tables in messages.
         allow_outside: whether paths outside the folder are allowed.

@@ -1,7 +1,4 @@
-"""Write a new capture.toml, with comments that explain each part, or replace the picked points in one.
-
-A new file marks missing values. When points are replaced, everything else is kept, including comments.
-"""
+"""Write a new capture.toml, with comments on each part and missing values, or replace the picked points in one."""
 
 from __future__ import annotations
 
@@ -283,11 +280,7 @@ def _after(lines: list[str]) -> list[str]:
 
 
 def _check(before: str, after: str, picks: Bootstrap) -> None:
-    """Check that two texts differ only in the picked points.
-
-    Raises:
-        ValueError: the texts differ elsewhere.
-    """
+    """Raise ValueError unless two texts differ only in the picked points."""
     try:
         old, new = tomllib.loads(before), tomllib.loads(after)
         written = Bootstrap.model_validate(new.pop(_TABLE))

@@ -65,11 +65,9 @@ class LightCurve:
 
 
 def frame_of_timecode(text: str, fps: float) -> int:
-    """Convert a time code to the number of frames since midnight.
+    """Convert a time code HH:MM:SS:FF, or with ";" or "." before FF for drop-frame counting, to frames since midnight.
 
-    Args:
-        text: HH:MM:SS:FF, with ";" or "." before FF for drop-frame counting.
-        fps: frame rate [Hz]; time codes at 23.976 Hz count 24 frames per second.
+    `fps` is the frame rate [Hz]; time codes at 23.976 Hz count 24 frames per second.
 
     Raises:
         CaptureError: the text is not a time code, or not valid at this frame rate.

@@ -64,13 +64,7 @@ def read_face_table(path: str | os.PathLike[str]) -> FaceTable:
 
 
 def read_face_row(header: str, row: str, number: int, path: str | os.PathLike[str]) -> FaceTable:
-    """Read one row of a face table, for tables that are read while they are written.
-
-    Args:
-        header: the first line of the table.
-        row: another line.
-        number: number of that line in the table.
-        path: the table, for messages.
+    """Read one row, the line of a given number, of a face table that is read while it is written.
 
     Raises:
         FormatError: as for `read_face_table`.

@@ -142,12 +142,7 @@ def _offer(folder: Path) -> str:
 
 
 def wrong_kind(key: str, path: PurePath) -> str | None:
-    """Return why a key in capture.toml rejects the type of a file, and the accepted types; None if accepted.
-
-    Args:
-        key: the key, such as `upper_teeth`, `video`, `calibration`.
-        path: the file, judged by its suffix.
-    """
+    """Return why a key in capture.toml, such as `video`, rejects the suffix of a file, and what it accepts, or None."""
     group = _GROUPS.get(key, "")
     for kind, suffixes in _WRONG.get(group, ()):
         if path.suffix.lower() in suffixes:

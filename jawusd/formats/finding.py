@@ -10,15 +10,13 @@ from pydantic import AfterValidator
 
 from jawusd.base.errors import shown
 
+#: An error makes the result impossible or useless; a warning may make it wrong; a note explains what was done.
 Severity = Literal["error", "warning", "note"]
 
 
 @dataclass(frozen=True)
 class Finding:
-    """Problem or remark: place, measured value, limit, and what to do.
-
-    An error makes the result impossible or useless; a warning may make it wrong; a note explains what was done.
-    """
+    """Problem or remark: place, measured value, limit, and what to do."""
 
     kind: str  # stable identifier for programs, such as "scans_apart"
     severity: Severity

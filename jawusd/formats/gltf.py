@@ -68,13 +68,7 @@ def save_glb(
 ) -> None:
     """Write nodes under a named root, atomically; times that are equal in single precision are dropped.
 
-    Args:
-        path: File to write.
-        name: Name of the root and of the animation.
-        materials: Materials, by the names that surfaces refer to.
-        nodes: Nodes to write.
-        generator: Name of the writing program.
-        extras: Metadata of the animation.
+    `name` is also that of the animation, `extras` its metadata. Surfaces refer to materials by name.
 
     Raises:
         OutputError: the file cannot be written.

@@ -65,12 +65,7 @@ class MarkerTable:
 
 
 def mark_hidden(points: Array, zeros: bool = True) -> Array:
-    """Return positions (F, N, 3) with NaN where a marker is hidden.
-
-    Args:
-        points: positions as read from the file.
-        zeros: whether a marker at exactly 0 0 0 counts as hidden.
-    """
+    """Return positions (F, N, 3) with NaN where a marker is hidden; `zeros`: also where it is at exactly 0 0 0."""
     with np.errstate(invalid="ignore"):
         seen: Mask = np.all(np.abs(points) < _OUT_OF_SIGHT, axis=-1)
     if zeros:
@@ -79,11 +74,7 @@ def mark_hidden(points: Array, zeros: bool = True) -> Array:
 
 
 def read_markers(path: str | os.PathLike[str]) -> MarkerTable:
-    """Read marker positions from text.
-
-    Args:
-        path: a table, or a pattern (`Marker%d_Traj.txt`) of numbered tables of equal length, whose markers are
-            concatenated in numerical order.
+    """Read marker positions from a table, or from a pattern (`Marker%d_Traj.txt`) of numbered tables of equal length.
 
     Raises:
         FormatError: a file is not a marker table or is truncated, a value is not a number, or tables differ in length.

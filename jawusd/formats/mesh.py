@@ -179,7 +179,7 @@ def byte_colors(values: Array) -> NDArray[np.uint8] | None:
 
 
 def cut_polygons(vertices: Array, counts: Indices, corners: Indices) -> tuple[Indices, Indices]:
-    """Triangulate polygons as fans.
+    """Triangulate polygons as fans: return the positions (F, 3) of corners in `corners`, and vertices (F, 3).
 
     A fan starts at the first corner from which all triangles face the same way as the polygon, so that concave quads
     are correct; polygons with fewer than three corners are dropped.
@@ -188,9 +188,6 @@ def cut_polygons(vertices: Array, counts: Indices, corners: Indices) -> tuple[In
         vertices: shape (V, 3).
         counts: number of corners of each polygon, shape (P,).
         corners: concatenated vertex indices of all polygons, shape (C,).
-
-    Returns:
-        The positions (F, 3) of each triangle's corners in `corners`, and its vertices (F, 3), in polygon order.
     """
     starts = np.cumsum(counts) - counts
     triangles, owners = [], []

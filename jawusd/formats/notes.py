@@ -35,8 +35,7 @@ class CameraCorrections(TypedDict, total=False):
 class Registration(TypedDict, total=False):
     """Registration of the lower scan to the occlusion found in the take, in skull (scan) axes.
 
-    `T` (4, 4) maps the lower scan from the given to the corrected position; shift and turn describe the same motion,
-    about the centre of the lower crowns.
+    Shift and turn describe the motion `T` (4, 4) of the scan about the centre of the lower crowns.
     """
 
     frames: Required[list[int]]  # number of frames with the teeth together

@@ -137,12 +137,10 @@ def _listed(table: TextTable) -> str:
 def read_poses(
     path: str | os.PathLike[str], columns: Mapping[str, str] | None = None
 ) -> tuple[NDArray[np.int64], Array]:
-    """Read jaw poses from CSV or JSON: frame numbers (F,) and T_skull_mandible (F, 4, 4).
+    """Read frame numbers (F,) and T_skull_mandible (F, 4, 4) from CSV or JSON; the last matrix row may be omitted.
 
-    Args:
-        path: table with matrix or quaternion columns, see the module; the last matrix row may be omitted.
-        columns: the file's names of columns that differ from the module's, e.g. {"tx": "X"}; rows are then numbered
-            from 0 if there is no frame column.
+    `columns` are the file's names of columns that differ from the module's, e.g. {"tx": "X"}; rows are then numbered
+    from 0 if there is no frame column.
 
     Raises:
         FormatError: a column is missing, a value is not a finite number, or a matrix is not rigid.
@@ -291,9 +289,6 @@ def save_joint_table(path: str | os.PathLike[str], rows: Iterable[JointDelta]) -
 
 
 def fixed_angles(R: Array) -> Array:
-    """Return the angles [rad] about the fixed axes x, then y, then z, shape (3,), of R = Rz Ry Rx (3, 3).
-
-    The formula is eq. 2.66 of J. J. Craig, "Introduction to Robotics", for rotations about y below 90 degrees.
-    """
+    """Return angles [rad] (3,) about fixed axes x, y, z of R = Rz Ry Rx (3, 3), |y| < 90 degrees (Craig, eq. 2.66)."""
     about_y = np.arctan2(-R[2, 0], np.hypot(R[0, 0], R[1, 0]))
     return np.array([np.arctan2(R[2, 1], R[2, 2]), about_y, np.arctan2(R[1, 0], R[0, 0])])

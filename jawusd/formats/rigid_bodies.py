@@ -1,8 +1,4 @@
-"""Read rigid bodies with markers.
-
-A body is given by a marker description file of Northern Digital (`.rig`), by the numbers of its markers in the table,
-or by their names.
-"""
+"""Read rigid bodies: a marker description of Northern Digital (`.rig`), or numbers or names of markers in the table."""
 
 from __future__ import annotations
 

@@ -251,12 +251,10 @@ def uncovered_percent(tracks: Tracks) -> Array:
 def worst_frames(
     badness: Array, frames: NDArray[np.int64], fps: float, most: int, taken: Sequence[int] = ()
 ) -> list[int]:
-    """Return indices of the frames with the highest badness, worst first, no two within half a second.
+    """Return indices of the frames with the highest badness (F,), worst first, no two within half a second; never NaN.
 
     Args:
-        badness: shape (F,); frames with NaN are never chosen.
         frames: frame numbers, shape (F,).
-        most: maximum number of frames.
         taken: indices of frames that were already chosen; returned frames are as far from these as from each other.
     """
     apart = max(round(_APART_S * fps), 1)

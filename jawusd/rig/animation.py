@@ -1,8 +1,7 @@
 """Animation layers: samples of d for tools that support the rig, and baked translations and quaternions for others.
 
-All readers interpolate d linearly between samples; the baked ops follow the model along that motion. Matrix ops are not
-used, because they shear when interpolated; nor is a product of one transform per parameter, which would be wrong by
-millimetres if several parameters are not 0.
+All readers interpolate d linearly between samples; the baked ops follow the model along that motion. Matrix ops would
+shear when interpolated, and a product of one transform per parameter would be wrong by millimetres.
 """
 
 from __future__ import annotations
@@ -54,18 +53,16 @@ def write_animation(
     by_skin: ArrayLike = (),
     skinned: Iterable[str] = (),
 ) -> Path:
-    """Write an animation layer that sublayers an actor; time codes are frame numbers.
+    """Write an animation layer (`.usdc` or `.usda`) that sublayers an actor; time codes are frame numbers.
 
     Args:
-        out: File to write, `.usdc` or `.usda`.
         actor: The `actor.usda` that the layer animates.
         frames: Increasing frame numbers (F,), possibly fractional: all frames, or only those of the keys.
         d: Parameters (F, 3) [mm]. Rows with NaN are lost frames, which are interpolated linearly and listed in the
             layer's `customLayerData["lostFrames"]`.
         rig: The evaluator; read from `actor` if None.
-        carried: Frames whose d was not measured but interpolated from neighbouring frames; listed in
-            `customLayerData["carriedFrames"]`.
-        by_skin: Frames whose d was estimated from facial skin; listed in `customLayerData["skinFrames"]`.
+        carried: Frames whose d was interpolated from neighbouring frames; listed as `carriedFrames`.
+        by_skin: Frames whose d was estimated from facial skin; listed as `skinFrames`.
         skinned: Paths of the meshes that are bound by `actor_skel.usdc`, a file in the same folder with the same
             motion. If there are any, a variant is added; see `add_skeleton_variant`.
 
@@ -135,13 +132,8 @@ def root_prim_of(actor: Path) -> str:
 def bake_times(rig: JawRig, frames: Array, d: Array, span: Array) -> tuple[Array, Array]:
     """Return the times (n,) of the baked samples and the poses T_skull_mandible (n, 4, 4) at these times.
 
-    The times are every whole frame of the span, every sample of d, and as many times in between as are needed to keep
-    all landmarks within 0.02 mm of the model.
-
-    Args:
-        frames: Times of the samples of d, increasing, shape (F,).
-        d: Values of d at these times [mm], shape (F, 3).
-        span: First and last time to cover.
+    The times are every whole frame of the span, every sample of d (F, 3) [mm], and as many times in between as are
+    needed to keep all landmarks within 0.02 mm of the model.
     """
     whole = np.arange(np.ceil(span[0]), np.floor(span[1]) + 1)
     times = np.union1d(np.union1d(whole, span), frames)
@@ -165,13 +157,12 @@ def bake_times(rig: JawRig, frames: Array, d: Array, span: Array) -> tuple[Array
 def author_motion(
     layer: Sdf.Layer, rig: JawRig, frames: Array, d: Array, span: Array, paths: tuple[str, str] = (ACTOR, MANDIBLE)
 ) -> None:
-    """Write samples of d and the baked ops of a mandible into a layer.
+    """Write samples of d and the baked ops of a mandible into a layer; `paths` are those of the actor and its mandible.
 
     Args:
         frames: Times of the samples of d, increasing, shape (F,).
         d: Values of d at these times [mm], shape (F, 3).
         span: First and last time to cover.
-        paths: Prim paths of the actor and of its mandible.
     """
     actor = Sdf.CreatePrimInLayer(layer, paths[0])
     for i, parameter in enumerate(PARAMETERS):
@@ -199,8 +190,8 @@ def _as_shown_by_usd(T_a: Array, T_b: Array, share: float) -> Array:
     """Return the transforms that OpenUSD computes between two samples, at the fraction `share` of the interval.
 
     OpenUSD interpolates quaternions by slerp (Shoemake 1985). Nearly equal ones (GfSlerp: cosine above 1 - 1e-5) are
-    interpolated linearly without normalising, and the angle is then taken from the real part alone (GfRotation). For
-    rotations near the identity, such as those of a closed jaw, this causes errors up to 0.4 mm.
+    interpolated linearly without normalising, and the angle is then taken from the real part alone (GfRotation), which
+    causes errors up to 0.4 mm near the identity.
     """
     q_a, q_b = wxyz_from_matrix(T_a[:, :3, :3]), wxyz_from_matrix(T_b[:, :3, :3])
     cosine = np.einsum("ij,ij->i", q_a, q_b)
@@ -226,18 +217,17 @@ def write_splines(
     slopes: ArrayLike | None = None,
     curved: ArrayLike | None = None,
 ) -> Path:
-    """Write a layer that sublayers an animation layer and contains the keys of the animation as splines.
+    """Write a layer that sublayers an animation layer and contains its keys as splines through the same samples.
 
-    The splines interpolate the animation's samples. Other layers of a rig contain no splines, because OpenUSD before
-    25.05 ignores them or cannot parse them, and other readers reject the whole file.
+    Other layers of a rig contain no splines, because OpenUSD before 25.05 and other readers cannot parse them.
 
     Args:
         animation: The animation layer written from the same keys.
         frames: Increasing key frames (F,).
         d: Keys (F, 3) [mm].
         slopes: Tangents at the keys (F, 3) [mm per frame]; zero if None.
-        curved: Mask (F - 1,) of segments that are cubic, with these tangents; the other segments are linear. If None,
-            all segments are linear.
+        curved: Mask (F - 1,) of segments that are cubic, with these tangents; the others are linear. None: all are
+            linear.
 
     Raises:
         RigError: The frames do not increase, or keys are not finite.

@@ -22,7 +22,7 @@ _FIRST = Usd.TimeCode.EarliestTime()
 
 
 class Fault(NamedTuple):
-    """A fault: severity ("error" or "warning"), path of the prim, message."""
+    """A fault: severity ("error" or "warning"), prim, message."""
 
     severity: str
     prim: Usd.Prim

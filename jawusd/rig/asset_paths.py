@@ -1,7 +1,7 @@
 """Files that a layer refers to, and the checksums that `actor.usda` records for the binary layers of a rig.
 
-Only the file of an asset path counts: format arguments and paths inside packages are removed. Checksums are compared
-before OpenUSD parses a file, which may crash on a damaged one.
+Only the file of an asset path counts, without format arguments and paths inside packages. Checksums are compared before
+OpenUSD parses a file, which may crash on a damaged one.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ def is_layer(asset: str) -> bool:
 def target_of(layer: Sdf.Layer, asset: str) -> str | None:
     """Return the full path of an asset of a layer, as resolved by OpenUSD, or the expected path of a missing file.
 
-    Return None for paths of another operating system, such as one with a drive letter, and for URLs whose scheme no
-    resolver supports. The resolver context of the stage must be bound.
+    Return None for paths of another operating system and URLs whose scheme no resolver supports. The resolver context
+    of the stage must be bound.
     """
     path, arguments = Sdf.Layer.SplitIdentifier(layer.ComputeAbsolutePath(asset))
     found = str(Ar.GetResolver().Resolve(path))
@@ -50,10 +50,7 @@ def target_of(layer: Sdf.Layer, asset: str) -> str | None:
 
 
 def with_variables(layer: Sdf.Layer, variables: Mapping[str, object]) -> Sdf.Layer:
-    """Return a copy of a layer with the given expression variables, which `asset_paths` uses.
-
-    The variables of referring layers are stronger than the layer's own. Without variables, return the layer itself.
-    """
+    """Return a copy of a layer with the given expression variables, or the layer itself without any."""
     if not variables:
         return layer
     copy = Sdf.Layer.CreateAnonymous(".usda")

@@ -149,11 +149,7 @@ def _spline_of(attribute: Usd.Attribute) -> Ts.Spline | None:
 
 
 def key_and_frame_times(attributes: Iterable[Usd.Attribute]) -> tuple[Array, Mask]:
-    """Return the times at which any of several attributes has samples, and the whole frames between them.
-
-    Returns:
-        Increasing times, shape (n,), and a mask of those that have samples, shape (n,).
-    """
+    """Return the times (n,) of samples of several attributes and whole frames between them, and a mask of samples."""
     keys = np.unique(np.concatenate([np.zeros(0), *(key_times(attribute) for attribute in attributes)]))
     first, last = np.ceil(keys.min(initial=np.inf)), np.floor(keys.max(initial=-np.inf))
     times = np.union1d(keys, np.arange(first, last + 1)) if 0 <= last - first < MAX_FRAMES else keys
@@ -166,10 +162,7 @@ def time_codes(times: Array) -> list[Usd.TimeCode]:
 
 
 def _upgrade_1_to_2(prim: Usd.Prim) -> None:
-    """Derive the tolerance of measured poses; format version 1 stored the smallest valid margin instead.
-
-    The other additions of format version 2 are optional: the glide surface table and the clearances of the teeth.
-    """
+    """Derive the tolerance of measured poses; format version 1 stored the smallest valid margin instead."""
     limit = read_value(prim, "jaw:thresholds:margin", prim.GetStage().GetRootLayer().identifier)
     if not isinstance(limit, float):
         raise FormatError(f"jaw:thresholds:margin is {limit!r}; expected a number.", path=str(prim.GetPath()))
@@ -181,9 +174,7 @@ UPGRADES: dict[int, Callable[[Usd.Prim], None]] = {1: _upgrade_1_to_2}
 
 
 def upgrade_rig(prim: Usd.Prim, where: object) -> None:
-    """Check the format version of a rig prim and upgrade it if it is older.
-
-    The new attributes are authored in the session layer of the stage, which is in memory and stronger than the files.
+    """Check the format version of a rig prim, and upgrade an older one in the session layer of the stage, in memory.
 
     Raises:
         FormatError: The version is not a positive integer.

@@ -1,7 +1,4 @@
-"""Write the complete folder of a rig from a model and the actor's meshes, and the layers that define the rig.
-
-These layers are the interface `actor.usda`, the decoder `rig.usdc` and the proxies `proxy.usdc`.
-"""
+"""Write the complete folder of a rig from a model and the actor's meshes, and the layers that define the rig."""
 
 from __future__ import annotations
 
@@ -71,11 +68,9 @@ _DECODER_ARRAYS = ("jaw:model:", "jaw:bounds:", "jaw:contact:", "jaw:joints:", "
 def proxy_layer(
     proxies: Mapping[str, Mesh], meshes: Mapping[str, Mesh], T_rest: Array, estimate: Estimate | None
 ) -> Sdf.Layer:
-    """Build `proxy.usdc`: the content of `geo.usdc` with proxies in place of meshes, and a class that adds them.
+    """Build `proxy.usdc`: the content of `geo.usdc` with proxies in place of some meshes, and a class that adds them.
 
-    Args:
-        proxies: Proxies for some of the meshes, with the same names and coordinate frames [mm].
-        meshes, T_rest, estimate: As for `build_geometry`.
+    The other arguments are those of `build_geometry`.
 
     Raises:
         RigError: A mesh without faces or with values that are not finite.
@@ -89,11 +84,7 @@ def proxy_layer(
 
 
 def _with_ordered_fields(layer: Sdf.Layer) -> Sdf.Layer:
-    """Return a layer read from the text of another.
-
-    Copies made by CopySpec have their fields in the order of memory addresses, so binary layers would differ between
-    runs.
-    """
+    """Return a layer read from the text of another; CopySpec orders fields by memory address, so files would differ."""
     ordered = Sdf.Layer.CreateAnonymous(".usda")
     ordered.ImportFromString(layer.ExportToString())
     return ordered
@@ -155,13 +146,7 @@ def _set_purpose(prim: Sdf.PrimSpec, purpose: str) -> None:
 def interface_layer(
     rig: JawRig, name: str, meshes: Mapping[str, Mesh], fps: float, proxies: Iterable[str] = ()
 ) -> Sdf.Layer:
-    """Build `actor.usda`, the interface for users and tools.
-
-    Args:
-        meshes: As for `build_geometry`.
-        fps: Time codes per second.
-        proxies: Names of the meshes that have a proxy in `proxy.usdc`; they add variants.
-    """
+    """Build `actor.usda`, the interface for users and tools; `proxies` are the names of the meshes in `proxy.usdc`."""
     layer = new_layer(fps)
     layer.subLayerPaths.append(f"./{layout.RIG_FILE}")
     actor = define_prim(layer, layout.ACTOR, "Xform")
@@ -204,10 +189,7 @@ def record_sidecars(layer: Sdf.Layer, folder: Path) -> None:
 
 
 def decoder_layer(rig: JawRig, table: DecoderTable) -> Sdf.Layer:
-    """Build `rig.usdc`: the exact model, the bounds, and the sampled table with its error.
-
-    JawRigAPI is not applied in this layer: only the interface that sublayers it is a rig.
-    """
+    """Build `rig.usdc`, without JawRigAPI: the exact model, the bounds, and the sampled table with its error."""
     layer = new_layer()
     actor = define_prim(layer, layout.ACTOR, "Xform")
     set_attribute(actor, "jaw:meta", _TYPES.String, json.dumps(rig.meta, sort_keys=True))
@@ -250,7 +232,8 @@ def bake_rig(
     """Write a rig: interface, decoder, geometry, ONNX graphs, captured motion if there is one, skeleton, package.
 
     A missing mandible mesh, and a missing skull with it, are replaced by estimated bones, which are marked as
-    placeholders. Every file is written atomically, `actor.usda` after the files it refers to.
+    placeholders. Every file is written atomically, `actor.usda` after the files it refers to. The files are returned in
+    the order written.
 
     Args:
         folder: Output folder; created if missing.
@@ -262,9 +245,6 @@ def bake_rig(
         table_size: Knots per axis of the sampled decoder: 17, 33 or 65.
         proxies: Low-polygon proxies of some of the meshes, with the same names; each adds variants.
         prim_name: Name of the actor's prim, and prefix of the joint names.
-
-    Returns:
-        The files, in the order written.
 
     Raises:
         RigError: Invalid meshes, bounds, frames, frame rate or prim name.

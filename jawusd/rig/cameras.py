@@ -50,22 +50,19 @@ def write_cameras(
     fps: float,
     light: Container[str] = (),
 ) -> list[Path]:
-    """Write the take: one `UsdGeom.Camera` per camera, and the actor moved by the tracked head.
+    """Write the take: one `UsdGeom.Camera` per camera, and the actor moved by the tracked head; return both files.
 
     The cameras are pinholes, which match undistorted images. `jaw:plate` is the printf pattern of these images,
     numbered by time code, relative to the take. `jaw:distortion` contains OpenCV's coefficients of the distorted
-    footage, and `jaw:imageSize` its size. The head's motion is written to a binary layer that the take sublayers.
+    footage, and `jaw:imageSize` its size.
 
     Args:
-        out: File to write, `.usda`; the motion goes to `<name>_motion.usdc` beside it.
+        out: File to write, `.usda`; the motion goes to `<name>_motion.usdc` beside it, which the take sublayers.
         actor: The layer of the actor that the take references, `anim_capture.usdc` or `actor.usda`.
         frames: Increasing frame numbers (F,).
         T_world_skull: Poses of the skull (F, 4, 4) [mm], NaN where lost.
         fps: Frames per second.
         light: Names of cameras whose plates are EXR files in linear light.
-
-    Returns:
-        The files of the motion and of the take, in the order written.
 
     Raises:
         RigError: No cameras, cameras of equal names, skewed pixels, or no frame with a pose.

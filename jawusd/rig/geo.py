@@ -42,11 +42,7 @@ _UV = "st"  # the conventional name of the primvar
 
 
 def write_look(prim: UsdGeom.Mesh, mesh: Mesh, plain: tuple[float, float, float]) -> None:
-    """Write a scan's natural colours per vertex as displayColor, and its texture coordinates.
-
-    Args:
-        plain: displayColor of scans without natural colours, linear red, green, blue.
-    """
+    """Write a scan's texture coordinates and, as displayColor, its natural colours per vertex or a plain linear RGB."""
     colors = natural_colors(mesh)
     if colors is None:
         prim.CreateDisplayColorAttr([plain])
@@ -225,17 +221,15 @@ def vertex_normals(mesh: Mesh) -> Array:
 def read_geometry(
     path: str | os.PathLike[str], prim_path: str | None = None, *, placeholders: bool = False
 ) -> dict[str, Mesh]:
-    """Read the meshes of a rig, as in `geo.usdc`: either scanned anatomy or placeholders.
+    """Read the meshes of a rig by the names of `MESH_PATHS`: either scanned anatomy or placeholders.
+
+    Skull and upper teeth are in the skull frame, mandible and lower teeth in the mandible frame [mm], in single
+    precision as stored, with the colours and texture coordinates of the scan.
 
     Args:
         path: A layer or package with the meshes, or a stage that references them.
         prim_path: The rig's prim; None: the only rig, or the default prim of a layer without rigs.
         placeholders: Whether to read placeholders.
-
-    Returns:
-        Meshes by the names of `MESH_PATHS`, omitting those the rig lacks. Skull and upper teeth are in the skull frame,
-        mandible and lower teeth in the mandible frame [mm], in single precision as stored. Colours and texture
-        coordinates are included if the scan had them.
 
     Raises:
         RigError: The file is not USD, or a mesh with faces other than triangles.
@@ -261,9 +255,7 @@ def read_geometry(
 
 @raises_format_error(0)
 def read_gum(path: str | os.PathLike[str], prim_path: str | None = None) -> dict[str, Mask]:
-    """Return masks of the gum faces (F,) of the teeth meshes, by the names of `MESH_PATHS`.
-
-    Meshes without a gum subset are omitted.
+    """Return masks of the gum faces (F,) of the teeth meshes with a gum subset, by the names of `MESH_PATHS`.
 
     Raises:
         RigError: The file is not USD.

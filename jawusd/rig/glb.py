@@ -76,10 +76,10 @@ def write_glb(
 
 
 def frame_at_zero(frames: Array) -> float:
-    """Return the frame that is at 0 s in the .glb of a take with frames (F,): frame 0, so that frame numbers are kept.
+    """Return the frame that is at 0 s in the .glb of a take with frames (F,): frame 0, or the first frame.
 
-    The first frame is returned instead if it is negative, because glTF has no times before 0, or if frame numbers are
-    too high for single precision, which glTF uses for times.
+    It is the first frame if that is negative, because glTF has no times before 0, or if frame numbers are too high for
+    the single precision of glTF's times.
     """
     return 0.0 if frames[0] >= 0 and frames[-1] <= _HIGHEST_FRAME else float(frames[0])
 
@@ -99,11 +99,7 @@ def _surface(title: str, mesh: Mesh, base: str, gum: Mask | None) -> Surface:
 
 
 def _split(faces: NDArray[np.int32], uv: Array) -> tuple[NDArray[np.int32], NDArray[np.int64], Array]:
-    """Split vertices on texture seams, so that each has one texture coordinate.
-
-    Returns:
-        Faces (F, 3), and for every new vertex the index of the original vertex (n,) and the texture coordinate (n, 2).
-    """
+    """Split vertices on texture seams: faces (F, 3), and per new vertex the old index (n,) and coordinates (n, 2)."""
     corners = np.column_stack([faces.reshape(-1), uv.reshape(-1, 2)])
     rows, index = np.unique(corners, axis=0, return_inverse=True)
     return index.reshape(-1, 3).astype(np.int32), rows[:, 0].astype(np.int64), rows[:, 1:]

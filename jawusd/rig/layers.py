@@ -83,12 +83,7 @@ _SPLINE_WARNING = "inner looping is deprecated"
 
 
 def new_layer(fps: float | None = None, default_prim: str = ACTOR) -> Sdf.Layer:
-    """Return an anonymous layer with the units of all jawusd files: Y up, millimetres.
-
-    Args:
-        fps: Time codes per second; None leaves them unset.
-        default_prim: Path of the default prim.
-    """
+    """Return an anonymous layer with the units of all jawusd files: Y up, millimetres; None leaves the rate unset."""
     layer = Sdf.Layer.CreateAnonymous(".usda")
     root = layer.pseudoRoot
     root.SetInfo(UsdGeom.Tokens.upAxis, UsdGeom.Tokens.y)
@@ -102,11 +97,9 @@ def new_layer(fps: float | None = None, default_prim: str = ACTOR) -> Sdf.Layer:
 
 
 def rename_actor(layer: Sdf.Layer, name: str, before: str = Sdf.Path(ACTOR).name, files: str = ".*") -> Sdf.Layer:
-    """Rename the actor's prims and joints in an anonymous layer, and update all paths to them.
+    """Rename the actor's prims and joints in an anonymous layer, in place, update all paths to them, and return it.
 
     Args:
-        layer: Changed in place, and returned.
-        name: The new name.
         before: The current name of the actor's prim; joint names may not have this prefix yet.
         files: Pattern of asset paths; prim paths in references and payloads to matching files are renamed too.
     """
@@ -187,10 +180,7 @@ def apply_jaw_api(spec: Sdf.PrimSpec, *others: str) -> None:
 def set_attribute(
     spec: Sdf.PrimSpec, name: str, type_name: Sdf.ValueTypeName, value: object, *, animated: bool = False
 ) -> None:
-    """Write an attribute with its default value, uniform unless animated.
-
-    All attributes are `custom`, because Blender imports no others.
-    """
+    """Write an attribute with its default value, uniform unless animated; Blender imports only `custom` attributes."""
     variability = Sdf.VariabilityVarying if animated else Sdf.VariabilityUniform
     attribute = Sdf.AttributeSpec(spec, name, type_name, variability, declaresCustom=True)
     attribute.default = value
@@ -203,10 +193,7 @@ def set_relationship(spec: Sdf.PrimSpec, name: str, targets: Iterable[str]) -> N
 
 
 def add_pose(prim: Usd.Prim, T: Array) -> None:
-    """Add translate and orient ops to a prim, with a pose (4, 4) as default value.
-
-    A matrix op would shear between video frames, because USD interpolates matrix samples entry by entry.
-    """
+    """Add translate and orient ops to a prim, with a default pose (4, 4); a matrix op would shear between frames."""
     xform = UsdGeom.Xformable(prim)
     xform.AddTranslateOp(UsdGeom.XformOp.PrecisionDouble).Set(translations(T[None])[0])
     xform.AddOrientOp(UsdGeom.XformOp.PrecisionDouble).Set(rotations(T[None])[0])

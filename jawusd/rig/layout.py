@@ -1,10 +1,8 @@
 """Names of a rig in USD: prim paths, files, attributes and the codeless schema JawRigAPI.
 
 Layers are built with the prim paths below and renamed after the actor when they are written (`layers.rename_actor`).
-`jawusd.evaluator.kinds` names the attributes of the model arrays.
-
-The schema provides documentation, slider limits and type checks. Rigs are read and written without it: attributes are
-found by name, and the applied schema in the raw `apiSchemas` metadata.
+Rigs are read and written without the schema plugin: attributes are found by name, and the applied schema in the raw
+`apiSchemas` metadata.
 """
 
 from __future__ import annotations
@@ -87,8 +85,7 @@ def actor_in_folder(path: Path) -> Path:
 def register_schema() -> bool:
     """Register the schema with OpenUSD and return whether that succeeded; may be called repeatedly.
 
-    OpenUSD builds its schema registry when a process first opens a stage. Plugins registered later are ignored (OpenUSD
-    issue 3596); in that case a warning is issued.
+    Plugins registered after a process first opened a stage are ignored (OpenUSD issue 3596); a warning is then issued.
     """
     folder = schema_folder()
     if folder is not None:

@@ -1,8 +1,4 @@
-"""Read the motion of the mandible in a stage, from transforms, bones or samples of d.
-
-The module also determines at which times and how closely a baked mandible must match its d, and how far the skull is
-moved.
-"""
+"""Read the motion of the mandible in a stage from transforms, bones or samples of d, and how far the skull is moved."""
 
 from __future__ import annotations
 
@@ -32,14 +28,11 @@ _RIGID = 1e-5  # maximum rigidity defect; single-precision quaternions written b
 
 @raises_format_error(0)
 def read_poses_of_stage(path: str | os.PathLike[str], prim_path: str | None = None) -> tuple[NDArray[np.int64], Array]:
-    """Read the poses of the mandible at every whole frame of a stage.
+    """Read frame numbers (F,) and T_skull_mandible (F, 4, 4) [mm] relative to the actor for all frames of a stage.
 
     Args:
         path: An animation layer of a rig, or a shot that references one.
         prim_path: The rig's prim, if the stage has several rigs.
-
-    Returns:
-        Frame numbers (F,) and T_skull_mandible (F, 4, 4) [mm], relative to the actor.
 
     Raises:
         RigError: The file is not a stage.
@@ -52,13 +45,9 @@ def read_poses_of_stage(path: str | os.PathLike[str], prim_path: str | None = No
 
 
 def poses_at(mandible: Usd.Prim, actor: Usd.Prim, times: ArrayLike, path: object) -> Array:
-    """Return the poses of a mandible relative to the skull, from transforms or bones.
+    """Return the poses T_skull_mandible (F, 4, 4) [mm] at times (F,), in the actor's units, from transforms or bones.
 
-    Args:
-        times: Times to read, shape (F,); if empty, the default time is read.
-
-    Returns:
-        T_skull_mandible [mm], shape (F, 4, 4), in the actor's units; relative to the actor if there is no skull.
+    Without times, the default time is read; without a skull, the poses are relative to the actor.
 
     Raises:
         FormatError: The motion is not rigid.
@@ -134,11 +123,9 @@ def _moving_prims(prim: Usd.Prim) -> list[Usd.Prim]:
 def read_parameters_of_stage(
     path: str | os.PathLike[str], prim_path: str | None = None
 ) -> tuple[Array, Array, float] | None:
-    """Read the samples of d in an animation layer.
+    """Read the times (F,), the samples of d (F, 3) [mm] and the frame rate of an animation layer; NaN in lost frames.
 
-    Returns:
-        Times (F,), d (F, 3) [mm] with NaN in the frames that the layer lists as lost, and frames per second; None if
-        the motion is given by transforms only.
+    None if the motion is given by transforms only.
 
     Raises:
         RigError: The file is not a stage.
@@ -182,9 +169,7 @@ def mandible_of(actor: Usd.Prim, path: object) -> Usd.Prim:
 
 
 def skull_of(actor: Usd.Prim, path: object) -> Usd.Prim | None:
-    """Return the skull prim of a rig; None if it is not set or inactive.
-
-    Without a skull prim, the skull frame is the actor's frame.
+    """Return the skull prim of a rig; None, for the actor's frame, if it is not set or inactive.
 
     Raises:
         FormatError: jaw:skull has several targets, or its target is missing.
@@ -240,18 +225,11 @@ def frames_of_stage(stage: Usd.Stage, path: object) -> NDArray[np.int64]:
 
 
 def comparison_times(actor: Usd.Prim, moving: list[Usd.Attribute], by_bones: bool) -> tuple[Array, Array]:
-    """Return the times at which a mandible is compared with d, and the allowed distances.
+    """Return increasing times (n,) at which a mandible is compared with d, and the allowed landmark distances [mm].
 
     The times are the keys of d and of the mandible (if only d is keyed, the jaw does not move), and the whole frames
-    between these keys (d and the mandible are interpolated differently). For bones the keys suffice: bones have a key
-    at every key of d.
-
-    Args:
-        moving: The attributes that move the mandible.
-        by_bones: Whether these attributes belong to joints.
-
-    Returns:
-        Increasing times, shape (n,), n = 0 if nothing has keys; landmark distances [mm], shape (max(n, 1),).
+    between these keys (d and the mandible are interpolated differently). Bones have a key at every key of d, so the
+    keys suffice. n is 0 if nothing has keys; there is then one distance.
     """
     times, keyed = key_and_frame_times([*moving, *(actor.GetAttribute(name) for name in PARAMETERS)])
     if by_bones:

@@ -136,10 +136,7 @@ class AnchoredChart:
         return loop_body(o, "opening", {"opening": 1, "low": 1, "high": 1, "parameters": 3})
 
     def _spline(self, g: Graph, q: Value) -> tuple[Value, Value]:
-        """Return the spline at q (n, 3), shape (n, 3), and its gradient, (n, 3 inputs, 3 outputs).
-
-        See `AnchoredModel`: sums of r_i times W_i, W_i c_i and W_i |c_i|^2 give both.
-        """
+        """Return the spline at q (n, 3), as `AnchoredModel._spline`, and its gradient (n, 3 inputs, 3 outputs)."""
         model = self._model
         centres, squares = model.centres, model.centres_squared
         kernel, linear = model.weights[: len(centres)], model.weights[len(centres) :]
@@ -302,11 +299,7 @@ def moved_vectors(g: Graph, w: Value, vectors: Value) -> Value:
 
 
 def loop_body(g: Graph, name: str, state: dict[str, int]) -> onnx.GraphProto:
-    """Return a graph as a loop body: an iteration reads the values NAME and writes NAME_out, with the graph's prefix.
-
-    Args:
-        state: number of columns of each value that an iteration passes to the next one.
-    """
+    """Return a graph as a loop body that reads NAME and writes NAME_out, prefixed, of given numbers of columns."""
 
     def columns(suffix: str) -> list[onnx.ValueInfoProto]:
         return [

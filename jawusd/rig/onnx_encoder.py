@@ -1,9 +1,7 @@
 """The exact jaw model as ONNX operators, and the search for the nearest pose of the model.
 
-As in `jawusd.evaluator.encoding`, the distance between two poses is that between four homogeneous vectors moved by
-each. Damped Gauss-Newton with analytic derivatives, an ONNX loop, minimises it in the chart of the model. It converges
-slowly for poses far from those of the model. If any row has not converged, a second loop continues with Newton's
-method.
+As in `jawusd.evaluator.encoding`, damped Gauss-Newton minimises the distance, in an ONNX loop. It converges slowly for
+poses far from those of the model: if any row has not converged, a second loop continues with Newton's method.
 """
 
 from __future__ import annotations
@@ -58,10 +56,7 @@ def add_twist(g: Graph, rig: JawRig, motion: RigidMotion[Value], name: str) -> N
 
 
 def images(g: Graph, rig: JawRig, motion: RigidMotion[Value], vectors: Array) -> Value:
-    """Return homogeneous vectors (4, m) of the mandible frame transformed to the skull frame, shape (n, 3 m).
-
-    The result is a displacement from the closed teeth, so that d = 0 is exact in any precision.
-    """
+    """Return homogeneous vectors (4, m) of the mandible frame in the skull frame, shape (n, 3 m), exact at d = 0."""
     to_skull = se3_inverse(rig.T_anatomical_skull)[:3, :3]
     at_rest = rig.T_anatomical_skull @ rig.T_rest @ vectors
     # entry (i, j) of [turn | t] moves vector k by to_skull[:, i] at_rest[j, k]
@@ -83,13 +78,7 @@ _MATRIX, _SLOPE, _COST = [0, 1, 2, 4, 5, 6, 8, 9, 10], [3, 7, 11], [15]
 
 
 def add_encoder(g: Graph, rig: JawRig, pose: Value, d: str, residual: str) -> None:
-    """Add the encoder to a graph.
-
-    Args:
-        pose: Poses (n, 4, 4).
-        d: Name of the output: parameters (n, 3) [mm].
-        residual: Name of the output: rms landmark distances (n,) [mm].
-    """
+    """Add to a graph parameters `d` (n, 3) [mm] and rms landmark distances `residual` (n,) [mm] of poses (n, 4, 4)."""
     f = Graph(np.float64, "f_")
     chart = CHARTS.get(rig.kind, ParameterChart)(rig)
     at_rest = rig.T_anatomical_skull @ rig.T_rest
@@ -202,10 +191,7 @@ def _measured(g: Graph, chart: Chart, vectors: Array, x: Value, target: Value) -
 
 
 def _curved(g: Graph, chart: Chart, vectors: Array, x: Value, target: Value) -> Value:
-    """Return `_measured` with half the Hessian of the cost in place of the Gauss-Newton matrix where it is definite.
-
-    The Hessian is the central difference of the gradient.
-    """
+    """Return `_measured` with half the Hessian, by central differences, as the matrix where it is definite."""
     around = g.reshape(g.reshape(x, [-1, 1, 3]) + g.constant(SHIFTS_MM[None]), [-1, 3])
     targets = g.reshape(g.reshape(target, [-1, 1, 12]) + g.constant(np.zeros((1, 7, 12))), [-1, 12])
     measured = g.reshape(_measured(g, chart, vectors, around, targets), [-1, 112])

@@ -184,8 +184,7 @@ class Graph:
     def lookup(self, x: Value, knots: Array, tables: Sequence[Array]) -> list[tuple[Value]]:
         """Return from each table the row (n, k) whose index is the number of knots (m, 1) at or below x.
 
-        The row is computed as a matrix product: row 0 plus, for each knot at or below x, the difference of two
-        consecutive rows.
+        It is row 0 plus, for each knot at or below x, the difference of two consecutive rows: a matrix product.
         """
         passed = self.op("Cast", self.op("GreaterOrEqual", x, self.constant(knots.T)), to=self.elem_type)
         return [(passed @ np.diff(table, axis=0) + self.constant(table[:1]),) for table in tables]

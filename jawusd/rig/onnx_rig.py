@@ -32,7 +32,8 @@ def load_onnx(path: str | os.PathLike[str], prim: str | None = None) -> JawRig:
     """Load the rig of an ONNX file, to be evaluated with the graphs in ONNX files.
 
     `X.onnx` decodes and contains the rig; `X_encode.onnx` in the same folder, if it exists, encodes. Files of older
-    versions contain no rig: `X.usda` or `model.npz` in the same folder then provides it; `prim` is as for `load_rig`.
+    versions contain no rig: `X.usda`, with `prim` as for `load_rig`, or `model.npz` in the same folder then provides
+    it.
 
     Raises:
         FormatError: The file is not a decoder of jawusd or was made from another model, or there is no rig in the file

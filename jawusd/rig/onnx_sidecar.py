@@ -1,11 +1,8 @@
 """The ONNX sidecars of a rig: exact graphs from d to pose, twist and margin, and from a pose to d and residual.
 
 Decoder and encoder are separate files: the decoder needs only arithmetic, which every runtime supports, but the encoder
-needs a loop. The batch size is dynamic. Graphs are run by onnxruntime if it is installed, otherwise by the reference
-evaluator of the package onnx, which is slower.
-
-The metadata of the decoder contain the whole rig as JSON, so that poses can be judged from this file alone: `arrays`,
-named as in `jawusd.evaluator.kinds` (landmarks, limits, contact field, ...), and `header`.
+needs a loop. Graphs are run by onnxruntime if it is installed, otherwise by the slower evaluator of the package onnx.
+The metadata of the decoder contain the whole rig as JSON: `arrays`, named as in `jawusd.evaluator.kinds`, and `header`.
 """
 
 from __future__ import annotations
@@ -203,15 +200,11 @@ def check_written(path: str | os.PathLike[str], rig: JawRig) -> None:
 
 
 def onnx_error_mm(path: str | os.PathLike[str], rig: JawRig, d: Array, recorded: str | None = None) -> float:
-    """Return the largest landmark distance [mm] between a graph and the model over parameters d (n, 3).
+    """Return the largest landmark distance [mm] between a graph and the model over parameters d (n, 3) [mm].
 
-    For a decoder, the poses of d from the graph and from the model are compared. An encoder gets the model's poses of d
-    and returns parameters; the model's poses of these are compared with the input.
-
-    Args:
-        d: Parameters (n, 3) [mm].
-        recorded: SHA-256 of the file as recorded in the rig; other files are rejected without parsing. None disables
-            the check: rigs baked before 0.1.0 record no checksum.
+    A decoder's poses of d are compared with the model's. An encoder gets the model's poses of d; the model's poses of
+    the parameters it returns are compared with them. `recorded` is the SHA-256 of the file in the rig; rigs baked
+    before 0.1.0 record none.
 
     Raises:
         FormatError: The file is not the recorded one, is not an ONNX file of jawusd, or was made from another model.

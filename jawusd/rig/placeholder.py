@@ -1,10 +1,9 @@
 """An estimated head for a subject without bone meshes: parametric bones, sized by the scans and the motion.
 
-It shows roughly where bone may be, not the anatomy, and is marked as estimated. The bones are those of
-`jawusd.meshes.bones`, scaled to the width and length of the lower arch and placed by bite and condyles. The condyles
-are taken from the landmarks, or from the motion if the landmarks are only mean adult positions. In opening and in
-protrusion the condyle slides along the same path, the eminence, so its trajectories form a thinner band than those of
-nearby points (the kinematic condylar centre; Kohno 1972, Yatabe et al. 1995, J Dent Res 74:1321).
+It shows roughly where bone may be, and is marked as estimated. The condyles are taken from the landmarks, or from the
+motion if the landmarks are only mean adult positions. In opening and in protrusion the condyle slides along the same
+path, so its trajectories form a thinner band than those of nearby points (the kinematic condylar centre; Kohno 1972,
+Yatabe et al. 1995, J Dent Res 74:1321).
 """
 
 from __future__ import annotations
@@ -56,10 +55,9 @@ class Estimate:
 
 
 def with_estimated_bones(rig: JawRig, meshes: Mapping[str, Mesh]) -> tuple[dict[str, Mesh], Estimate | None]:
-    """Return the meshes with an estimated mandible, and skull if neither bone is given; None if a mandible was given.
+    """Return the meshes with an estimated mandible, and skull if neither is given; None if a mandible was given.
 
-    Args:
-        meshes: As for `bake_rig`; upper teeth and skull in the skull frame, the others in the mandible frame [mm].
+    The meshes [mm] are in the frames of `bake_rig`.
     """
     if "mandible" in meshes:
         return dict(meshes), None
@@ -85,8 +83,7 @@ def _placed(bone: Mesh, T_anatomical_frame: Array) -> Mesh:
 def find_condyles(rig: JawRig) -> tuple[Array, str]:
     """Return the centres of left and right condyle, mandible frame [mm], shape (2, 3), and their source.
 
-    The motion determines the height and the front-to-back position of a condyle; the landmark determines its distance
-    from the midline.
+    The motion determines their height and depth, the landmark their distance from the midline.
     """
     landmarks = rig.landmarks[_CONDYLES]
     inferred = [text for text in rig.inferred if text.startswith("condyle") and MEAN_CONDYLES in text]
@@ -101,11 +98,9 @@ def find_condyles(rig: JawRig) -> tuple[Array, str]:
 
 
 def condyles_from_motion(poses: Array, mean: Array) -> Array | None:
-    """Return the condyle centres near mean positions whose trajectories form the thinnest band; None if unclear.
+    """Return the centres near `mean` (2, 3) [mm] with the thinnest band of trajectories in poses (N, 4, 4), or None.
 
-    Args:
-        poses: Motion in the anatomical frame, the identity with the teeth closed, shape (N, 4, 4).
-        mean: Mean adult positions of left and right condyle, anatomical frame [mm], shape (2, 3).
+    Both are in the anatomical frame; the poses are the identity with the teeth closed.
     """
     poses = poses[:: max(1, len(poses) // 400)]
     if len(poses) < _FEWEST_POSES:

@@ -50,10 +50,7 @@ _OFFSET = 1e-9
 
 
 def write_package(out: str | os.PathLike[str], source: str | os.PathLike[str]) -> Path:
-    """Flatten `actor.usda`, an animation layer on it, or a shot with several actors into a `.usdz`.
-
-    The layer inside is binary: a third of the size of text, and faster to open. The ONNX files are left out, because
-    packages may only contain USD, images and sound.
+    """Flatten `actor.usda`, an animation layer on it, or a shot with several actors into a `.usdz`, without ONNX files.
 
     Raises:
         RigError: The source cannot be opened or packed, or has no rig.
@@ -129,17 +126,15 @@ def publish_rig(
 ) -> list[Path]:
     """Copy the layers and ONNX graphs of a rig to another folder under prefixed names, and write a new package.
 
-    `actor.usda` becomes `hero.usda`, `rig.usdc` becomes `hero_rig.usdc`. References in the layers are updated.
+    `actor.usda` becomes `hero.usda`, `rig.usdc` becomes `hero_rig.usdc`. References in the layers are updated. The
+    files are returned in the order written.
 
     Args:
         folder: The rig's folder.
         out: The folder to write.
-        prefix: Prefix of all file names; None: the actor's name, in which characters that are not allowed in file names
-            are replaced.
+        prefix: Prefix of all file names; None: the actor's name, in which characters not allowed in file names are
+            replaced.
         prim_name: Name of the actor's prim and prefix of its joints; None: derived from the actor's name.
-
-    Returns:
-        The files, in the order written.
 
     Raises:
         RigError: There is no rig, the prefix is invalid, or the output is the rig's own folder.
@@ -171,11 +166,7 @@ def publish_rig(
 
 
 def _check_own(path: Path) -> None:
-    """Check that a file to be copied is a regular file, and not a link to another folder.
-
-    Raises:
-        RigError: The file is not a regular file, or links to another folder.
-    """
+    """Raise RigError if a file to be copied is not a regular file, or links to another folder."""
     check_input(path, RigError)
     if not is_allowed(path) and not path.resolve().is_relative_to(path.parent.resolve()):
         raise RigError("links to a file outside its own folder.", path=path, hint="Replace the link with a copy.")

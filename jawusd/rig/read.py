@@ -33,11 +33,9 @@ PathArg = str | os.PathLike[str]
 
 
 def load_rig(path: PathArg, prim_path: str | None = None) -> JawRig:
-    """Load the evaluator of a rig from a layer or package that contains it.
+    """Load the evaluator of a rig from a layer or package that contains it, or any stage that references an actor.
 
-    Args:
-        path: `actor.usda`, an animation layer, a package, or any stage that references an actor.
-        prim_path: The rig's prim, if the stage has several rigs.
+    `prim_path` is the rig's prim, if the stage has several rigs.
 
     Raises:
         FormatError: No rig, several rigs, missing or malformed values.

@@ -91,8 +91,8 @@ def motion_of_stage(
 
     Args:
         prim_path: The rig's prim, if the stage has several rigs.
-        origin: Source to read; None: the animated source or, if both are animated and disagree, the source in the
-            stronger layer.
+        origin: Source to read; None: the animated source or, if both are animated and disagree, the one in the stronger
+            layer.
 
     Raises:
         RigError: The file is not a stage, or d and mandible disagree and are in the same layer.
@@ -179,8 +179,6 @@ def write_over(
         out: File to write; it sublayers the stage.
         frames: Increasing frame numbers, shape (F,).
         d: Jaw parameters [mm], shape (F, 3); rows with NaN are interpolated.
-        fps: Frames per second.
-        prim_path: The rig's prim.
         carried, by_skin: Frames whose d was inferred; see `write_animation`.
 
     Raises:
@@ -214,20 +212,17 @@ def write_rebaked(
     """Write a layer for a stage with the d of its rigs and the corresponding ops of their mandibles.
 
     Instances are made editable, because their mandibles cannot be moved otherwise. Rigs with a selected skeleton are
-    switched to transforms.
+    switched to transforms. The result lists the paths on which the stage's root layer has its own opinions, which are
+    stronger than those of a sublayer.
 
     Args:
-        out: File to write.
         motions: The motions, one for each rig to animate.
         carried, by_skin: Times whose d was inferred; see `write_animation`.
         root: Whether the layer sublayers the stage; if not, it is meant to become a sublayer of the stage.
 
-    Returns:
-        Paths on which the stage's root layer has its own opinions, which are stronger than those of a sublayer.
-
     Raises:
-        RigError: The file is not a stage, the output is the stage itself, or a mandible would not have
-            the pose of its d.
+        RigError: The file is not a stage, the output is the stage itself, or a mandible would not have the pose of its
+            d.
         FormatError: No rig or several rigs, or no mandible.
         OutputError: The file cannot be written.
     """
@@ -287,11 +282,7 @@ def _author(layer: Sdf.Layer, actor: Usd.Prim, motion: Rebaked, shot: object) ->
 
 
 def _check_moves(layer: Sdf.Layer, prims: list[str], motions: Sequence[Rebaked], shot: str | os.PathLike[str]) -> None:
-    """Compose a layer over its stage and check that its mandibles have the poses given by d in the world.
-
-    Raises:
-        RigError: The pose of a mandible differs from that given by d.
-    """
+    """Raise RigError if a mandible, composed in its stage with a layer, lacks the pose given by d in the world."""
     root = Sdf.Layer.CreateAnonymous(".usda")
     root.timeCodesPerSecond = layer.timeCodesPerSecond
     root.subLayerPaths = [layer.identifier, str(Path(shot).resolve())]

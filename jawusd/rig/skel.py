@@ -54,10 +54,9 @@ def write_skel(
     d: ArrayLike | None = None,
     prim_name: str = Sdf.Path(ACTOR).name,
 ) -> Path:
-    """Write the skeleton layer next to `geo.usdc`, whose meshes it binds rigidly to two joints.
+    """Write the skeleton layer next to `geo.usdc`, whose meshes it binds rigidly to two joints, without d and bounds.
 
-    The joint `skull/jaw` is midway between the condyles and has one key per frame. The layer contains no d1, d2, d3 and
-    no bounds.
+    The joint `skull/jaw` is midway between the condyles and has one key per frame.
 
     Args:
         out: File to write, in the folder of `geo.usdc`.
@@ -84,13 +83,10 @@ def write_skel(
 
 
 def add_skeleton_variant(layer: Sdf.Layer, rig: JawRig, meshes: Iterable[str]) -> None:
-    """Add the variants `transforms` (selected, empty) and `skeleton` to the actor of an animation layer.
+    """Add the variants `transforms` (selected, empty) and `skeleton` to the actor of an animation layer, for meshes.
 
     Joints and keys are referenced from `actor_skel.usdc` next to the layer. The prim above the meshes becomes the
     SkelRoot, because a variant cannot change the type of the actor's prim, which `actor.usda` sets.
-
-    Args:
-        meshes: Paths of the meshes that follow the bones.
     """
     actor = Sdf.CreatePrimInLayer(layer, ACTOR)
     variants = Sdf.VariantSetSpec(actor, MOTION)

@@ -46,13 +46,9 @@ class StagePoses(NamedTuple):
 def carries_rig(path: str | os.PathLike[str], prim_path: str | None = None) -> bool:
     """Return whether a stage has a rig whose mandible is moved by transforms or bones, so that no fit is needed.
 
-    Args:
-        path: Any stage.
-        prim_path: The rig's prim, if the stage has several rigs.
-
     Raises:
         RigError: The file is not a stage.
-        FormatError: The prim is not a rig, although others are.
+        FormatError: The given prim is not a rig, although others are.
     """
     stage = open_stage(path)
     rigs = rig_prims(stage)
@@ -70,10 +66,9 @@ def fit_poses_of_stage(
     skull: str | None = None,
     rig_prim: str | None = None,
 ) -> StagePoses:
-    """Fit the meshes of an actor to a stage at every whole frame.
+    """Fit the meshes of an actor to a stage, which moves copies of them in any way, at every whole frame.
 
     Args:
-        path: Any stage with copies of the actor's meshes, moved by transforms, bones or time-sampled points.
         actor: The rig's own file, which contains the meshes in their coordinate frames.
         mandible: Prim below which the lower teeth or the mandible are searched; None to search the whole stage.
         skull: The same for the upper teeth or the skull.

@@ -73,15 +73,9 @@ def sample_valid(rig: JawRig, count: int, seed: int = 0) -> Array:
 
 
 def grid_axes(rig: JawRig, box: Array, points: Array, size: int) -> tuple[Array, Array, Array]:
-    """Return axis values of d1, d2 and d3 that minimise the error of linear interpolation.
+    """Return values (size,) [mm] of d1, d2 and d3 over a box (3, 2) that minimise the error of linear interpolation.
 
-    Args:
-        box: Range of each parameter [mm], shape (3, 2).
-        points: Mandible points whose motion is considered, mandible frame [mm], shape (V, 3).
-        size: Number of values per axis.
-
-    Returns:
-        Three increasing arrays (size,) [mm] that span the box. They contain 0, so that the closed bite is exact.
+    They contain 0, so that the closed bite is exact. The error counts at mandible points (V, 3) [mm], mandible frame.
     """
     points = points[:: max(1, len(points) // _POINTS)]
     return _axis(rig, box, points, 0, size), _axis(rig, box, points, 1, size), _axis(rig, box, points, 2, size)
@@ -173,15 +167,9 @@ def _located(axis: Array, x: Array) -> tuple[NDArray[np.intp], Array]:
 
 
 def build_table(rig: JawRig, vertices: Array, size: int = DEFAULT_SIZE) -> DecoderTable:
-    """Sample a rig and measure the table's error.
+    """Sample a rig with 17, 33 or 65 values per axis, and measure the error at vertices (V, 3) [mm], mandible frame.
 
-    Args:
-        vertices: Mandible vertices (V, 3), mandible frame [mm], at which the error is measured.
-        size: Values per axis, 17, 33 or 65.
-
-    Returns:
-        A grid, or three curves for an additive model. The model has no cross terms, so interpolation along the axes
-        is the only error of the curves.
+    The table is a grid, or three curves for an additive model, which has no cross terms.
 
     Raises:
         RigError: An unsupported size, or bounds that allow no parameters.
@@ -207,8 +195,8 @@ def build_table(rig: JawRig, vertices: Array, size: int = DEFAULT_SIZE) -> Decod
 def _balanced_twists(rig: JawRig, axes: tuple[Array, Array, Array]) -> Array:
     """Return twists at the knots, shape (n1, n2, n3, 6), shifted to balance the errors of interpolation.
 
-    Interpolating exact values gives errors of one sign, largest in the middle of the cells. Half of that error,
-    averaged over the two cells along each axis, is subtracted at the knots. The closed bite stays exact.
+    Interpolating exact values gives errors of one sign, largest in the middle of the cells. Half of it, averaged over
+    both cells along each axis, is subtracted at the knots. The closed bite stays exact.
     """
     exact = rig.twist(grid_points(axes)).reshape(*map(len, axes), 6)
     out = exact.copy()
@@ -228,8 +216,7 @@ def _balanced_twists(rig: JawRig, axes: tuple[Array, Array, Array]) -> Array:
 def table_error(rig: JawRig, table: DecoderTable, vertices: Array, d: Array) -> float:
     """Return the largest distance [mm] between table and model at any vertex (V, 3), over parameters d (n, 3).
 
-    The distance is a convex function of the vertex position, so the worst parameters are found using only the vertices
-    that are extreme in some direction. These parameters are then checked at every vertex.
+    The worst parameters are found with the extreme vertices, since the distance is convex, and checked at every vertex.
     """
     exact = rig.pose(d)
     read = table.pose(d, rig.T_rest)
@@ -246,8 +233,7 @@ def landmark_distance(rig: JawRig, T_a: Array, T_b: Array) -> Array:
 def largest_distance(T_a: Array, T_b: Array, points: Array) -> Array:
     """Return the largest distance [mm], shape (n,), between points (V, 3) under two sets of poses (n, 4, 4).
 
-    |(T_a - T_b) p|^2 is a quadratic form in (p, 1) with ten coefficients per pose and ten products per point, so that
-    one matrix product evaluates all.
+    Its square is a quadratic form in (p, 1), so that one matrix product evaluates all.
     """
     D = (T_a - T_b)[:, :3, :]
     Q = np.swapaxes(D, 1, 2) @ D

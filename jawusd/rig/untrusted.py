@@ -59,8 +59,7 @@ _RIG_ATTRIBUTES = ("jaw:formatVersion", "jaw:model", "jaw:bounds", "jaw:decoder"
 def raises_format_error(argument: int) -> Callable[[Callable[P, R]], Callable[P, R]]:
     """Return a decorator that turns errors from values of unexpected types into FormatError.
 
-    Args:
-        argument: Index of the positional argument of the decorated function that names the file.
+    `argument` is the index of the positional argument that names the file.
     """
 
     def decorate(function: Callable[P, R]) -> Callable[P, R]:
@@ -115,15 +114,12 @@ def _unreadable(file: Path, error: BaseException | None = None) -> str:
 
 
 def check_file_access(path: Path) -> list[Sdf.Layer]:
-    """Check, before a layer or package is composed, which files its layers refer to.
+    """Return the layers of a stage after checking, before it is composed, which files they refer to.
 
     Layers of a rig may refer only to files in the rig's folder or below, with links resolved. Layers that use a rig
     (animations, shots) may refer to rigs outside their folder, but not to other files outside. Asset paths in attribute
     values are checked too, because their files are read (ONNX) or packed (images). Files in allowed folders are always
-    accepted; see `base.inputs`. Paths are resolved as OpenUSD does, including search paths and variable expressions.
-
-    Returns:
-        The layers, which stay loaded as long as they are referenced.
+    accepted; see `base.inputs`. Paths are resolved as OpenUSD does.
 
     Raises:
         RigError: A path is not allowed, or a layer is damaged.
@@ -180,12 +176,7 @@ def check_composed(stage: Usd.Stage, checked: list[Sdf.Layer]) -> None:
 
 
 def _referenced_layers(layer: Sdf.Layer, rig_folder: Path | None, variables: Mapping[str, object]) -> list[_LayerRef]:
-    """Check all files that a layer refers to, and return the layers among them.
-
-    Args:
-        rig_folder: Folder of the rig that the layer is part of; None if it only uses rigs.
-        variables: Expression variables of the layer.
-    """
+    """Check all files that a layer with expression variables refers to, and return the layers among them."""
     folder = rig_folder or file_of_layer(layer).resolve().parent
     read = with_variables(layer, variables)
     found: list[_LayerRef] = []
@@ -212,11 +203,7 @@ def _referenced_layers(layer: Sdf.Layer, rig_folder: Path | None, variables: Map
 
 
 def _checked_file(layer: Sdf.Layer, asset: str, folder: Path) -> Path:
-    """Return the file of an asset path after checking it.
-
-    Raises:
-        RigError: The file, with links resolved, is outside the folder and not allowed.
-    """
+    """Return the file of an asset path; raise RigError if it is outside the folder, links resolved, and not allowed."""
     target = target_of(layer, asset)
     if target is None or not (is_allowed(file_of(target)) or file_of(target).resolve().is_relative_to(folder)):
         found = f"refers to the file {asset:.200}, outside the folder of this file."
@@ -225,11 +212,7 @@ def _checked_file(layer: Sdf.Layer, asset: str, folder: Path) -> Path:
 
 
 def _layer(name: str, sums: Mapping[Path, str]) -> Sdf.Layer | None:
-    """Open a layer after comparing its file with the checksum that the rig records; None if the file is missing.
-
-    Raises:
-        RigError: The file is damaged, or not a layer.
-    """
+    """Open a layer after comparing its file with the checksum that the rig records; None if the file is missing."""
     file = file_of(name)
     if not file.exists():
         return None
@@ -247,11 +230,7 @@ def _layer(name: str, sums: Mapping[Path, str]) -> Sdf.Layer | None:
 
 
 def _is_intact(layer: Sdf.Layer) -> bool:
-    """Return whether a layer contains all prims and properties it lists; OpenUSD aborts the process if one is missing.
-
-    Raises:
-        RigError: The layer exceeds the limits.
-    """
+    """Return whether a layer contains all it lists; OpenUSD aborts the process if a prim or property is missing."""
     missing, count = [], 0
 
     def visit(path: Sdf.Path) -> None:

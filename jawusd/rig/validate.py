@@ -39,10 +39,7 @@ _NO_STOCK = "OpenUSD's own validators were not run: they need usd-core 26.5 or n
 
 
 def register_validators() -> bool:
-    """Register the rules with UsdValidation, so that all validation in this process applies them.
-
-    Returns False if this version of OpenUSD does not accept validators written in Python.
-    """
+    """Register the rules with UsdValidation, for the whole process; False if this OpenUSD does not accept them."""
     if not _PLUGGABLE:
         return False
     registry = UsdValidation.ValidationRegistry()
@@ -54,9 +51,7 @@ def register_validators() -> bool:
 
 
 def validate_stage(path: str | os.PathLike[str]) -> list[Finding]:
-    """Return the findings of UsdValidation and jawusd's own rules about a USD file.
-
-    A file without a rig is checked by OpenUSD's own validators only.
+    """Return the findings of UsdValidation and, for rigs, of jawusd's own rules about a USD file.
 
     Raises:
         RigError: The file cannot be opened.
@@ -119,11 +114,7 @@ def find_nvidia_validator() -> Path | None:
 
 
 def nvidia_findings(path: str | os.PathLike[str], program: Path) -> list[Finding]:
-    """Return the findings of NVIDIA's validator with its default rules.
-
-    Args:
-        path: The file to validate.
-        program: The validator, from `find_nvidia_validator`.
+    """Return the findings of NVIDIA's validator, a program from `find_nvidia_validator`, with its default rules.
 
     Raises:
         RigError: The program wrote no report.
