@@ -23,35 +23,6 @@ from jawusd.rig.animation import write_animation
 from jawusd.rig.asset_paths import record_checksums
 from jawusd.rig.attributes import write_arrays
 from jawusd.rig.geo import MESH_PATHS, build_geometry, check_meshes, extent, hide_look
-from jawusd.rig.layers import (
-    apply_jaw_api,
-    define_prim,
-    new_layer,
-    rename_actor,
-    set_attribute,
-    set_relationship,
-    stage_of,
-    write_layer,
-)
-from jawusd.rig.layout import (
-    ACTOR,
-    ACTOR_FILE,
-    BOTH,
-    CAPTURED_FILE,
-    DETAIL,
-    ENCODE_FILE,
-    GEO_FILE,
-    MANDIBLE,
-    ONNX_FILE,
-    PACKAGE_FILE,
-    PROXY,
-    PROXY_FILE,
-    PROXY_SUFFIX,
-    RIG_FILE,
-    SCAN,
-    SKEL_FILE,
-    check_prim_name,
-)
 from jawusd.rig.onnx_sidecar import check_written, decode_model, encode_model, write_onnx
 from jawusd.rig.placeholder import Estimate, with_estimated_bones
 from jawusd.rig.publish import write_package
@@ -59,7 +30,7 @@ from jawusd.rig.skel import write_skel
 from jawusd.rig.table import DEFAULT_SIZE, DecoderTable, build_table, grid_points, sample_valid
 
 _TYPES = Sdf.ValueTypeNames
-_PROXY_CLASS = ACTOR + PROXY_SUFFIX
+_PROXY_CLASS = layout.ACTOR + layout.PROXY_SUFFIX
 # Prefixes of the attributes in the text layer, which stays short; long arrays go to the binary layer.
 _INTERFACE_ARRAYS = ("jaw:landmarks:", "jaw:thresholds:")
 _DECODER_ARRAYS = ("jaw:model:", "jaw:bounds:", "jaw:contact:", "jaw:joints:", "jaw:motion:")
@@ -77,7 +48,7 @@ def proxy_layer(
     """
     layer = build_geometry({**meshes, **proxies}, T_rest, estimate)
     _define_proxy_class(layer, proxies)
-    stage = stage_of(layer)
+    stage = layers.stage_of(layer)
     for name, proxy in proxies.items():
         hide_look(UsdGeom.Mesh(stage.GetPrimAtPath(MESH_PATHS[name])), proxy, meshes[name])
     return _with_ordered_fields(layer)
@@ -92,13 +63,15 @@ def _with_ordered_fields(layer: Sdf.Layer) -> Sdf.Layer:
 
 def _define_proxy_class(layer: Sdf.Layer, proxies: Iterable[str]) -> None:
     """Define the class with the proxies under new names; binary layers store the equal arrays only once."""
-    Sdf.CopySpec(layer, ACTOR, layer, _PROXY_CLASS)  # the copy includes the materials to which the meshes are bound
+    Sdf.CopySpec(
+        layer, layout.ACTOR, layer, _PROXY_CLASS
+    )  # the copy includes the materials to which the meshes are bound
     layer.GetPrimAtPath(_PROXY_CLASS).specifier = Sdf.SpecifierClass
-    mandible = layer.GetPrimAtPath(MANDIBLE.replace(ACTOR, _PROXY_CLASS))
+    mandible = layer.GetPrimAtPath(layout.MANDIBLE.replace(layout.ACTOR, _PROXY_CLASS))
     for attribute in list(mandible.properties):
         mandible.RemoveProperty(attribute)
     for name, path in MESH_PATHS.items():
-        mesh = layer.GetPrimAtPath(path.replace(ACTOR, _PROXY_CLASS))
+        mesh = layer.GetPrimAtPath(path.replace(layout.ACTOR, _PROXY_CLASS))
         if mesh is not None and name not in proxies:
             del mesh.nameParent.nameChildren[mesh.name]
         elif mesh is not None:
@@ -118,14 +91,14 @@ def add_detail_variants(actor: Sdf.PrimSpec, proxies: Iterable[str]) -> None:
     Args:
         proxies: Names of the meshes that have a proxy.
     """
-    variants = Sdf.VariantSetSpec(actor, DETAIL)
-    Sdf.VariantSpec(variants, SCAN)
-    file = f"./{PROXY_FILE}"
-    for name, payload in ((PROXY, Sdf.Payload(file)), (BOTH, Sdf.Payload(file, _PROXY_CLASS))):
+    variants = Sdf.VariantSetSpec(actor, layout.DETAIL)
+    Sdf.VariantSpec(variants, layout.SCAN)
+    file = f"./{layout.PROXY_FILE}"
+    for name, payload in ((layout.PROXY, Sdf.Payload(file)), (layout.BOTH, Sdf.Payload(file, _PROXY_CLASS))):
         Sdf.VariantSpec(variants, name).primSpec.payloadList.prependedItems = [payload]
-    actor.variantSetNameList.prependedItems = [DETAIL]
-    actor.variantSelections[DETAIL] = SCAN
-    both = actor.path.AppendVariantSelection(DETAIL, BOTH)
+    actor.variantSetNameList.prependedItems = [layout.DETAIL]
+    actor.variantSelections[layout.DETAIL] = layout.SCAN
+    both = actor.path.AppendVariantSelection(layout.DETAIL, layout.BOTH)
     for name in proxies:
         scan = Sdf.CreatePrimInLayer(actor.layer, Sdf.Path(MESH_PATHS[name]).ReplacePrefix(actor.path, both))
         _set_purpose(scan, UsdGeom.Tokens.render)
@@ -147,16 +120,16 @@ def interface_layer(
     rig: JawRig, name: str, meshes: Mapping[str, Mesh], fps: float, proxies: Iterable[str] = ()
 ) -> Sdf.Layer:
     """Build `actor.usda`, the interface for users and tools; `proxies` are the names of the meshes in `proxy.usdc`."""
-    layer = new_layer(fps)
+    layer = layers.new_layer(fps)
     layer.subLayerPaths.append(f"./{layout.RIG_FILE}")
-    actor = define_prim(layer, layout.ACTOR, "Xform")
+    actor = layers.define_prim(layer, layout.ACTOR, "Xform")
     actor.kind = Kind.Tokens.component
     actor.assetInfo = {
         "identifier": Sdf.AssetPath(f"./{layout.ACTOR_FILE}"),
         "name": name,
         "version": str(layout.FORMAT_VERSION),
     }
-    apply_jaw_api(actor, "GeomModelAPI")
+    layers.apply_jaw_api(actor, "GeomModelAPI")
     actor.payloadList.prependedItems = [Sdf.Payload(f"./{layout.GEO_FILE}")]
     if names := list(proxies):
         add_detail_variants(actor, names)
@@ -164,20 +137,20 @@ def interface_layer(
     hint.default = layers.vec3f_array(motion_extent(rig, meshes))
 
     for parameter, limits in zip(layout.PARAMETERS, rig.d_range, strict=True):
-        set_attribute(actor, parameter, _TYPES.Double, 0.0, animated=True)
-        set_attribute(actor, f"{parameter}:range", _TYPES.Double2, layers.vec2d(limits))
-    set_attribute(actor, "jaw:formatVersion", _TYPES.Int, layout.FORMAT_VERSION)
-    set_attribute(actor, "jaw:actor", _TYPES.String, name)
-    set_attribute(actor, "jaw:lengthUnit", _TYPES.Token, "mm")
-    set_attribute(actor, "jaw:angleUnit", _TYPES.Token, "rad")
-    set_attribute(actor, "jaw:twistOrder", _TYPES.TokenArray, Vt.TokenArray(["omega", "v"]))
-    set_attribute(actor, "jaw:modelHash", _TYPES.String, rig.model_hash)
+        layers.set_attribute(actor, parameter, _TYPES.Double, 0.0, animated=True)
+        layers.set_attribute(actor, f"{parameter}:range", _TYPES.Double2, layers.vec2d(limits))
+    layers.set_attribute(actor, "jaw:formatVersion", _TYPES.Int, layout.FORMAT_VERSION)
+    layers.set_attribute(actor, "jaw:actor", _TYPES.String, name)
+    layers.set_attribute(actor, "jaw:lengthUnit", _TYPES.Token, "mm")
+    layers.set_attribute(actor, "jaw:angleUnit", _TYPES.Token, "rad")
+    layers.set_attribute(actor, "jaw:twistOrder", _TYPES.TokenArray, Vt.TokenArray(["omega", "v"]))
+    layers.set_attribute(actor, "jaw:modelHash", _TYPES.String, rig.model_hash)
     for attribute, file in zip(layout.ONNX_ATTRIBUTES, (layout.ONNX_FILE, layout.ENCODE_FILE), strict=True):
-        set_attribute(actor, attribute, _TYPES.Asset, Sdf.AssetPath(f"./{file}"))
-    set_attribute(actor, "jaw:landmarks:names", _TYPES.TokenArray, Vt.TokenArray(list(LANDMARKS)))
+        layers.set_attribute(actor, attribute, _TYPES.Asset, Sdf.AssetPath(f"./{file}"))
+    layers.set_attribute(actor, "jaw:landmarks:names", _TYPES.TokenArray, Vt.TokenArray(list(LANDMARKS)))
     write_arrays(actor, rig, _INTERFACE_ARRAYS)
-    set_relationship(actor, "jaw:skull", [layout.SKULL])
-    set_relationship(actor, "jaw:mandible", [layout.MANDIBLE])
+    layers.set_relationship(actor, "jaw:skull", [layout.SKULL])
+    layers.set_relationship(actor, "jaw:mandible", [layout.MANDIBLE])
     return layer
 
 
@@ -190,18 +163,20 @@ def record_sidecars(layer: Sdf.Layer, folder: Path) -> None:
 
 def decoder_layer(rig: JawRig, table: DecoderTable) -> Sdf.Layer:
     """Build `rig.usdc`, without JawRigAPI: the exact model, the bounds, and the sampled table with its error."""
-    layer = new_layer()
-    actor = define_prim(layer, layout.ACTOR, "Xform")
-    set_attribute(actor, "jaw:meta", _TYPES.String, json.dumps(rig.meta, sort_keys=True))
-    set_attribute(actor, "jaw:model:kind", _TYPES.Token, rig.kind)
+    layer = layers.new_layer()
+    actor = layers.define_prim(layer, layout.ACTOR, "Xform")
+    layers.set_attribute(actor, "jaw:meta", _TYPES.String, json.dumps(rig.meta, sort_keys=True))
+    layers.set_attribute(actor, "jaw:model:kind", _TYPES.Token, rig.kind)
     write_arrays(actor, rig, _DECODER_ARRAYS)
-    set_attribute(actor, "jaw:decoder:format", _TYPES.Token, table.format)
-    set_attribute(actor, "jaw:decoder:shape", _TYPES.IntArray, layers.int_array([len(axis) for axis in table.axes]))
+    layers.set_attribute(actor, "jaw:decoder:format", _TYPES.Token, table.format)
+    layers.set_attribute(
+        actor, "jaw:decoder:shape", _TYPES.IntArray, layers.int_array([len(axis) for axis in table.axes])
+    )
     for i, axis in enumerate(table.axes, start=1):
-        set_attribute(actor, f"jaw:decoder:d{i}Knots", _TYPES.DoubleArray, layers.double_array(axis))
-    set_attribute(actor, "jaw:decoder:twists", _TYPES.FloatArray, layers.float_array(table.twists))
-    set_attribute(actor, "jaw:decoder:maxError", _TYPES.Double, float(table.max_error_mm))
-    set_attribute(actor, "jaw:decoder:errorSamples", _TYPES.Int, int(table.error_samples))
+        layers.set_attribute(actor, f"jaw:decoder:d{i}Knots", _TYPES.DoubleArray, layers.double_array(axis))
+    layers.set_attribute(actor, "jaw:decoder:twists", _TYPES.FloatArray, layers.float_array(table.twists))
+    layers.set_attribute(actor, "jaw:decoder:maxError", _TYPES.Double, float(table.max_error_mm))
+    layers.set_attribute(actor, "jaw:decoder:errorSamples", _TYPES.Int, int(table.error_samples))
     return layer
 
 
@@ -227,7 +202,7 @@ def bake_rig(
     d: ArrayLike | None = None,
     table_size: int = DEFAULT_SIZE,
     proxies: Mapping[str, Mesh] | None = None,
-    prim_name: str = Sdf.Path(ACTOR).name,
+    prim_name: str = Sdf.Path(layout.ACTOR).name,
 ) -> list[Path]:
     """Write a rig: interface, decoder, geometry, ONNX graphs, captured motion if there is one, skeleton, package.
 
@@ -257,31 +232,33 @@ def bake_rig(
     if not fps > 0:
         raise RigError(f"the frame rate is {fps}; it must be greater than 0.", path=folder)
     check_meshes(meshes)
-    check_prim_name(prim_name)
+    layout.check_prim_name(prim_name)
     meshes, estimate = with_estimated_bones(rig, meshes)
     geometry = build_geometry(meshes, rig.T_rest, estimate)
     moving = np.concatenate([meshes[key].vertices for key in ("mandible", "lower_teeth")])
     table = build_table(rig, moving, table_size)
-    written = [write_layer(rename_actor(geometry, prim_name), folder / GEO_FILE)]
+    written = [layers.write_layer(layers.rename_actor(geometry, prim_name), folder / layout.GEO_FILE)]
     if proxies:
         thinned = proxy_layer(proxies, meshes, rig.T_rest, estimate)
-        written.append(write_layer(rename_actor(thinned, prim_name), folder / PROXY_FILE))
+        written.append(layers.write_layer(layers.rename_actor(thinned, prim_name), folder / layout.PROXY_FILE))
     written += [
-        write_layer(rename_actor(decoder_layer(rig, table), prim_name), folder / RIG_FILE),
-        write_onnx(folder / ONNX_FILE, decode_model(rig)),
-        write_onnx(folder / ENCODE_FILE, encode_model(rig)),
+        layers.write_layer(layers.rename_actor(decoder_layer(rig, table), prim_name), folder / layout.RIG_FILE),
+        write_onnx(folder / layout.ONNX_FILE, decode_model(rig)),
+        write_onnx(folder / layout.ENCODE_FILE, encode_model(rig)),
     ]
-    for sidecar in (ONNX_FILE, ENCODE_FILE):
+    for sidecar in (layout.ONNX_FILE, layout.ENCODE_FILE):
         check_written(folder / sidecar, rig)
     interface = interface_layer(rig, name, meshes, fps, proxies or ())
     record_sidecars(interface, folder)
     record_checksums(interface, folder, [path.name for path in written if path.suffix == ".usdc"])
-    written.append(write_layer(rename_actor(interface, prim_name), folder / ACTOR_FILE))
-    written.append(write_skel(folder / SKEL_FILE, rig, list(meshes), fps, frames, d, prim_name))
-    shown = folder / ACTOR_FILE
+    written.append(layers.write_layer(layers.rename_actor(interface, prim_name), folder / layout.ACTOR_FILE))
+    written.append(write_skel(folder / layout.SKEL_FILE, rig, list(meshes), fps, frames, d, prim_name))
+    shown = folder / layout.ACTOR_FILE
     if frames is not None and d is not None:
         skinned = [MESH_PATHS[key] for key in meshes]
-        shown = write_animation(folder / CAPTURED_FILE, folder / ACTOR_FILE, frames, d, fps, rig=rig, skinned=skinned)
+        shown = write_animation(
+            folder / layout.CAPTURED_FILE, folder / layout.ACTOR_FILE, frames, d, fps, rig=rig, skinned=skinned
+        )
         written.append(shown)
-    written.append(write_package(folder / PACKAGE_FILE, shown))
+    written.append(write_package(folder / layout.PACKAGE_FILE, shown))
     return written

@@ -17,22 +17,8 @@ from pxr import Gf, Sdf, Usd, UsdUtils
 from jawusd.base.errors import RigError
 from jawusd.base.inputs import check_input, is_allowed
 from jawusd.formats.atomic import atomic_path, scratch_folder
+from jawusd.rig import layers, layout
 from jawusd.rig.asset_paths import CHECKSUMS, record_checksums
-from jawusd.rig.layers import rename_actor, write_layer
-from jawusd.rig.layout import (
-    ACTOR_FILE,
-    CAPTURED_FILE,
-    ENCODE_FILE,
-    GEO_FILE,
-    ONNX_ATTRIBUTES,
-    ONNX_FILE,
-    PACKAGE_FILE,
-    PROXY_FILE,
-    RIG_FILE,
-    check_prim_name,
-    has_jaw_api,
-    prim_name_of,
-)
 from jawusd.rig.read import describe, open_stage
 
 # File time in packages [s since 1970]; a fixed time makes packages reproducible. It is the earliest time that a zip can
@@ -42,7 +28,7 @@ _OP = "xformOp:"
 _PREFIX = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,63}")
 _LAYERS, _COPIED = (".usda", ".usdc", ".usd"), (".onnx",)
 # Files of a rig, each before the files that refer to it.
-_FIRST = (GEO_FILE, PROXY_FILE, RIG_FILE, ONNX_FILE, ENCODE_FILE, ACTOR_FILE)
+_FIRST = (layout.GEO_FILE, layout.PROXY_FILE, layout.RIG_FILE, layout.ONNX_FILE, layout.ENCODE_FILE, layout.ACTOR_FILE)
 _NAMES_INSIDE = "actor.usdc", "shot.usdc"
 # Offset that makes integers non-integer: binary layers compress vectors of small integers, which three.js (r187)
 # decodes as NaN.
@@ -82,7 +68,7 @@ def _flattened(stage: Usd.Stage, source: str | os.PathLike[str]) -> Sdf.Layer:
             # flattening drops `custom` if the schema is known, and Blender imports only custom attributes
             if prop.name.startswith("jaw:"):
                 prop.custom = True
-        for attribute in ONNX_ATTRIBUTES:
+        for attribute in layout.ONNX_ATTRIBUTES:
             if attribute in actor.properties:
                 actor.RemoveProperty(actor.properties[attribute])
         # the identifier is an asset path, so its file would be packed
@@ -94,7 +80,7 @@ def _flattened(stage: Usd.Stage, source: str | os.PathLike[str]) -> Sdf.Layer:
 def _rigs_in(layer: Sdf.Layer) -> list[Sdf.Path]:
     """Return the rig prims of a flattened layer; its prototypes have other paths than those of the stage."""
     flat = Usd.Stage.Open(layer)
-    return [prim.GetPath() for prim in flat.TraverseAll() if has_jaw_api(prim)]
+    return [prim.GetPath() for prim in flat.TraverseAll() if layout.has_jaw_api(prim)]
 
 
 def _avoid_integers(layer: Sdf.Layer) -> None:
@@ -141,7 +127,7 @@ def publish_rig(
         OutputError: A file cannot be written.
     """
     folder, out = Path(folder), Path(out)
-    actor = folder / ACTOR_FILE
+    actor = folder / layout.ACTOR_FILE
     described = describe(actor)
     if prefix is None:
         prefix = re.sub(r"[^A-Za-z0-9_-]", "_", described["actor"])
@@ -159,10 +145,13 @@ def publish_rig(
     for name in names:
         _check_own(folder / name)
     out.mkdir(parents=True, exist_ok=True)
-    prims = Sdf.Path(described["prim"]).name, check_prim_name(prim_name or prim_name_of(described["actor"]))
+    prims = (
+        Sdf.Path(described["prim"]).name,
+        layout.check_prim_name(prim_name or layout.prim_name_of(described["actor"])),
+    )
     written = [_copy(folder / name, out / new, names, prims) for name, new in names.items()]
-    shown = names.get(CAPTURED_FILE, names[ACTOR_FILE])
-    return [*written, write_package(out / _prefixed(prefix, PACKAGE_FILE), out / shown)]
+    shown = names.get(layout.CAPTURED_FILE, names[layout.ACTOR_FILE])
+    return [*written, write_package(out / _prefixed(prefix, layout.PACKAGE_FILE), out / shown)]
 
 
 def _check_own(path: Path) -> None:
@@ -191,9 +180,11 @@ def _copy(source: Path, target: Path, names: dict[str, str], prims: tuple[str, s
         return f"./{names[parts[0]]}" if len(parts) == 1 and parts[0] in names else asset
 
     UsdUtils.ModifyAssetPaths(layer, renamed)
-    rename_actor(layer, prims[1], prims[0], "|".join(["", *(rf"\./{re.escape(new)}" for new in names.values())]))
-    if source.name == ACTOR_FILE:
+    layers.rename_actor(layer, prims[1], prims[0], "|".join(["", *(rf"\./{re.escape(new)}" for new in names.values())]))
+    if source.name == layout.ACTOR_FILE:
         record_checksums(
-            layer, target.parent, [names[name] for name in (GEO_FILE, PROXY_FILE, RIG_FILE) if name in names]
+            layer,
+            target.parent,
+            [names[name] for name in (layout.GEO_FILE, layout.PROXY_FILE, layout.RIG_FILE) if name in names],
         )
-    return write_layer(layer, target)
+    return layers.write_layer(layer, target)

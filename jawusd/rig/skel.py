@@ -18,27 +18,14 @@ from jawusd.base.errors import FormatError
 from jawusd.evaluator import JawRig
 from jawusd.geometry.anatomy import LANDMARKS
 from jawusd.geometry.se3 import make_transform, se3_inverse, transform_points
-from jawusd.rig import layers
+from jawusd.rig import layers, layout
 from jawusd.rig.geo import MESH_PATHS
-from jawusd.rig.layers import define_prim, new_layer, rename_actor, stage_of, write_layer
-from jawusd.rig.layout import (
-    ACTOR,
-    GEO,
-    GEO_FILE,
-    MANDIBLE,
-    MOTION,
-    SKEL_FILE,
-    SKELETON,
-    SKULL,
-    TRANSFORMS,
-    meshes_below,
-)
 
 _TYPES = Sdf.ValueTypeNames
 
 JOINTS = ("skull", "skull/jaw")
-SKEL, KEYS = f"{ACTOR}/Skel", f"{ACTOR}/Skel/Motion"
-_SKEL_IN_GEO = f"{GEO}/Skel"
+SKEL, KEYS = f"{layout.ACTOR}/Skel", f"{layout.ACTOR}/Skel/Motion"
+_SKEL_IN_GEO = f"{layout.GEO}/Skel"
 # Maximum difference between the matrix entries of meshes that move together [mm or 1]; far above single-precision
 # rounding at 100 mm from the origin.
 SAME_MOTION = 1e-4
@@ -52,7 +39,7 @@ def write_skel(
     fps: float,
     frames: ArrayLike | None = None,
     d: ArrayLike | None = None,
-    prim_name: str = Sdf.Path(ACTOR).name,
+    prim_name: str = Sdf.Path(layout.ACTOR).name,
 ) -> Path:
     """Write the skeleton layer next to `geo.usdc`, whose meshes it binds rigidly to two joints, without d and bounds.
 
@@ -68,18 +55,18 @@ def write_skel(
     Raises:
         OutputError: The file cannot be written.
     """
-    layer = new_layer(fps)
-    root = define_prim(layer, ACTOR, "SkelRoot")
+    layer = layers.new_layer(fps)
+    root = layers.define_prim(layer, layout.ACTOR, "SkelRoot")
     root.kind = Kind.Tokens.component
-    stage = stage_of(layer)
+    stage = layers.stage_of(layer)
     _define_skeleton(stage, _hinge(rig))
     keys = _define_motion(stage, rig, frames, d)
     if keys is not None:
         layer.startTimeCode, layer.endTimeCode = float(keys[0]), float(keys[-1])
-    _bind(layer, rig, [Sdf.Path(MESH_PATHS[name]) for name in mesh_names], Sdf.Path(SKEL), Sdf.Path(MANDIBLE))
-    root.payloadList.prependedItems = [Sdf.Payload(f"./{GEO_FILE}")]
+    _bind(layer, rig, [Sdf.Path(MESH_PATHS[name]) for name in mesh_names], Sdf.Path(SKEL), Sdf.Path(layout.MANDIBLE))
+    root.payloadList.prependedItems = [Sdf.Payload(f"./{layout.GEO_FILE}")]
     del stage
-    return write_layer(rename_actor(layer, prim_name), Path(out))
+    return layers.write_layer(layers.rename_actor(layer, prim_name), Path(out))
 
 
 def add_skeleton_variant(layer: Sdf.Layer, rig: JawRig, meshes: Iterable[str]) -> None:
@@ -88,24 +75,24 @@ def add_skeleton_variant(layer: Sdf.Layer, rig: JawRig, meshes: Iterable[str]) -
     Joints and keys are referenced from `actor_skel.usdc` next to the layer. The prim above the meshes becomes the
     SkelRoot, because a variant cannot change the type of the actor's prim, which `actor.usda` sets.
     """
-    actor = Sdf.CreatePrimInLayer(layer, ACTOR)
-    variants = Sdf.VariantSetSpec(actor, MOTION)
-    Sdf.VariantSpec(variants, TRANSFORMS)
-    Sdf.VariantSpec(variants, SKELETON)
-    actor.variantSetNameList.prependedItems = [MOTION]
-    actor.variantSelections[MOTION] = TRANSFORMS
-    inside = Sdf.Path(ACTOR).AppendVariantSelection(MOTION, SKELETON)
+    actor = Sdf.CreatePrimInLayer(layer, layout.ACTOR)
+    variants = Sdf.VariantSetSpec(actor, layout.MOTION)
+    Sdf.VariantSpec(variants, layout.TRANSFORMS)
+    Sdf.VariantSpec(variants, layout.SKELETON)
+    actor.variantSetNameList.prependedItems = [layout.MOTION]
+    actor.variantSelections[layout.MOTION] = layout.TRANSFORMS
+    inside = Sdf.Path(layout.ACTOR).AppendVariantSelection(layout.MOTION, layout.SKELETON)
 
     def in_variant(path: str) -> Sdf.Path:
-        return Sdf.Path(path).ReplacePrefix(Sdf.Path(ACTOR), inside)
+        return Sdf.Path(path).ReplacePrefix(Sdf.Path(layout.ACTOR), inside)
 
     # all specs are overs: the meshes are defined in the payload
-    Sdf.CreatePrimInLayer(layer, in_variant(GEO)).typeName = "SkelRoot"
+    Sdf.CreatePrimInLayer(layer, in_variant(layout.GEO)).typeName = "SkelRoot"
     skeleton = Sdf.CreatePrimInLayer(layer, in_variant(_SKEL_IN_GEO))
-    skeleton.referenceList.prependedItems = [Sdf.Reference(f"./{SKEL_FILE}", SKEL)]
+    skeleton.referenceList.prependedItems = [Sdf.Reference(f"./{layout.SKEL_FILE}", SKEL)]
     # the prims above the meshes are bound too, so that proxies next to the meshes inherit the binding
-    paths = [in_variant(path) for path in (SKULL, MANDIBLE, *meshes)]
-    _bind(layer, rig, paths, Sdf.Path(_SKEL_IN_GEO), in_variant(MANDIBLE))
+    paths = [in_variant(path) for path in (layout.SKULL, layout.MANDIBLE, *meshes)]
+    _bind(layer, rig, paths, Sdf.Path(_SKEL_IN_GEO), in_variant(layout.MANDIBLE))
 
 
 def joint_poses(rig: JawRig, d: Array) -> Array:
@@ -203,7 +190,7 @@ class Bones:
         Raises:
             FormatError: A mesh is deformed, not bound, or moves differently from the others.
         """
-        for mesh in meshes_below(self._prim):
+        for mesh in layout.meshes_below(self._prim):
             if mesh.GetPath() not in {skinning.GetPrim().GetPath() for skinning, _ in self._bound}:
                 raise FormatError(
                     f"bones move other meshes of {self._prim.GetPath()}, but not {mesh.GetPath()}.",
