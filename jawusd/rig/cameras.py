@@ -73,30 +73,37 @@ def write_cameras(
     frames, T_world_skull = np.asarray(frames, dtype=np.float64), np.asarray(T_world_skull, dtype=np.float64)
     if T_world_skull.shape != (len(frames), 4, 4):
         raise ValueError(f"T_world_skull must have shape {(len(frames), 4, 4)}, got {T_world_skull.shape}")
-    names = [Sdf.Path(TAKE_CAMERAS).AppendChild(_prim_name(camera.name)) for camera in cameras]
-    if not names or len(set(names)) < len(names):
-        raise RigError("a take needs cameras with unique names.", path=out)
     known = np.isfinite(T_world_skull).all(axis=(1, 2))
     if not known.any():
         raise RigError("the skull has no pose in any frame.", path=out)
     motion = out.with_name(f"{out.stem}_motion.usdc")
-    layer = new_layer(fps, TAKE)
+    layer = _camera_layer(cameras, fps, light, out)
     layer.startTimeCode, layer.endTimeCode = float(frames[0]), float(frames[-1])
-    define_prim(layer, TAKE, "Xform").kind = Kind.Tokens.assembly
-    define_prim(layer, TAKE_CAMERAS, "Scope")
     actor_path = f"{TAKE}/{root_prim_of(Path(actor))}"
     shown = define_prim(layer, actor_path, "Xform")
     stage = stage_of(layer)
     add_pose(stage.GetPrimAtPath(TAKE), _FLIP)
-    for name, camera in zip(names, cameras, strict=True):
-        plate = LIGHT_PLATE if camera.name in light else PLATE
-        _define_camera(stage, name, camera, plate.format(name=camera.name))
     # Close the stage: on an anonymous layer it would fail to resolve the relative paths below, with a warning.
     del stage
     layer.subLayerPaths.append(relative_path(motion, out))
     shown.referenceList.prependedItems = [Sdf.Reference(relative_path(Path(actor), out))]
     moving = _motion_layer(actor_path, frames[known], T_world_skull[known], fps)
     return [write_layer(moving, motion), write_layer(layer, out)]
+
+
+def _camera_layer(cameras: Sequence[Camera], fps: float, light: Container[str], out: Path) -> Sdf.Layer:
+    """Return a layer with the cameras of a take."""
+    names = [Sdf.Path(TAKE_CAMERAS).AppendChild(_prim_name(camera.name)) for camera in cameras]
+    if not names or len(set(names)) < len(names):
+        raise RigError("a stage needs cameras with unique names.", path=out)
+    layer = new_layer(fps, TAKE)
+    define_prim(layer, TAKE, "Xform").kind = Kind.Tokens.assembly
+    define_prim(layer, TAKE_CAMERAS, "Scope")
+    stage = stage_of(layer)
+    for name, camera in zip(names, cameras, strict=True):
+        plate = LIGHT_PLATE if camera.name in light else PLATE
+        _define_camera(stage, name, camera, plate.format(name=camera.name))
+    return layer
 
 
 def _prim_name(name: str) -> str:
@@ -126,18 +133,7 @@ def write_camera_stage(out: str | os.PathLike[str], cameras: Sequence[Camera]) -
         RigError: No cameras, cameras of equal names, or skewed pixels.
         OutputError: The file cannot be written.
     """
-    out = Path(out)
-    names = [Sdf.Path(TAKE_CAMERAS).AppendChild(_prim_name(camera.name)) for camera in cameras]
-    if not names or len(set(names)) < len(names):
-        raise RigError("a camera stage needs cameras with unique names.", path=out)
-    layer = new_layer(24.0, TAKE)
-    define_prim(layer, TAKE, "Xform").kind = Kind.Tokens.assembly
-    define_prim(layer, TAKE_CAMERAS, "Scope")
-    stage = stage_of(layer)
-    for name, camera in zip(names, cameras, strict=True):
-        _define_camera(stage, name, camera, PLATE.format(name=camera.name))
-    del stage
-    return write_layer(layer, out)
+    return write_layer(_camera_layer(cameras, 24.0, (), Path(out)), Path(out))
 
 
 @raises_format_error(0)
