@@ -49,11 +49,7 @@ Rule = Callable[[Usd.Prim], Iterator[Finding]]
 
 def check_model(prim: Usd.Prim) -> Iterator[Finding]:
     """Check that version, units and model arrays can be read, and that the motion was made with this model."""
-    try:
-        rig = rig_of(prim, _where(prim))
-    except JawusdError as error:
-        yield _finding("error", "Model", prim, error.message)
-        return
+    rig = rig_of(prim, _where(prim))
     own, made_for = recorded_hashes(prim)
     if own not in (None, rig.model_hash):
         message = "the rig was baked from another model (jaw:modelHash): files of several actors were mixed, "
@@ -68,11 +64,7 @@ def check_model(prim: Usd.Prim) -> Iterator[Finding]:
 
 def check_table(prim: Usd.Prim) -> Iterator[Finding]:
     """Check that the sampled table is complete and within its stated error of the exact model."""
-    try:
-        table = read_table(prim, _where(prim))
-    except JawusdError as error:
-        yield _finding("error", "Table", prim, error.message)
-        return
+    table = read_table(prim, _where(prim))
     rig = _rig(prim)
     if rig is None:
         return
@@ -134,11 +126,7 @@ def check_mandible(prim: Usd.Prim) -> Iterator[Finding]:
     if not prim.IsLoaded():
         yield _finding("error", "Mandible", prim, "the geometry (payload) is not loaded and cannot be checked.")
         return
-    try:
-        mandible = mandible_of(prim, _where(prim))
-    except FormatError as error:
-        yield _finding("error", "Mandible", prim, error.message)
-        return
+    mandible = mandible_of(prim, _where(prim))
     bones, body = bones_of(mandible), UsdGeom.Xformable(mandible)
     names = [(op.GetOpName(), op.GetTypeName()) for op in body.GetOrderedXformOps()]
     if bones is None and (names != _OPS or body.GetResetXformStack()):
@@ -160,10 +148,8 @@ def check_mandible(prim: Usd.Prim) -> Iterator[Finding]:
         yield _finding("error", "Mandible", mandible, error.message)
         return
     if not away_mm <= BAKED_MM:
-        message = (
-            f"the skull is moved in the actor by {away_mm:.3f} mm; the maximum is {BAKED_MM} mm. "
-            "Move the actor instead."
-        )
+        message = f"the skull is moved in the actor by {away_mm:.3f} mm; the maximum is {BAKED_MM} mm. "
+        message += "Move the actor instead."
         yield _finding("error", "Mandible", prim, message)
         return
     unkeyed = not any(attribute.GetNumTimeSamples() for attribute in moving)
@@ -196,13 +182,15 @@ def _check_baked(
         yield _finding("error", "Mandible", mandible, message)
 
 
-def _reporting_malformed_values(name: str, rule: Rule) -> Rule:
-    """Return a rule that reports values of unexpected types as an error."""
+def _reporting_errors(name: str, rule: Rule) -> Rule:
+    """Return a rule that reports what cannot be read, and values of unexpected types, as an error."""
 
     @functools.wraps(rule)
     def checked(prim: Usd.Prim) -> Iterator[Finding]:
         try:
             yield from rule(prim)
+        except JawusdError as error:
+            yield _finding("error", name, prim, error.message)
         except VALUE_ERRORS as error:
             yield _finding("error", name, prim, value_error_message(error))
 
@@ -210,7 +198,7 @@ def _reporting_malformed_values(name: str, rule: Rule) -> Rule:
 
 
 RULES: dict[str, Rule] = {
-    name: _reporting_malformed_values(name, rule)
+    name: _reporting_errors(name, rule)
     for name, rule in {
         "Model": check_model,
         "Table": check_table,

@@ -73,12 +73,13 @@ def _rig_prims(stage: Usd.Stage) -> list[Usd.Prim]:
     return list(first.values())
 
 
+def _severities() -> dict[str, UsdValidation.ValidationErrorType]:
+    kinds = UsdValidation.ValidationErrorType
+    return {"error": kinds.Error, "warning": kinds.Warn, "info": kinds.Info}
+
+
 def _stage_validator(rule: Rule) -> Callable[[Usd.Stage, object], list[UsdValidation.ValidationError]]:
-    severities = {
-        "error": UsdValidation.ValidationErrorType.Error,
-        "warning": UsdValidation.ValidationErrorType.Warn,
-        "info": UsdValidation.ValidationErrorType.Info,
-    }
+    severities = _severities()
 
     def validate(stage: Usd.Stage, time_range: object = None) -> list[UsdValidation.ValidationError]:
         return [
@@ -96,15 +97,9 @@ def _stage_validator(rule: Rule) -> Callable[[Usd.Stage, object], list[UsdValida
 
 
 def _finding(error: UsdValidation.ValidationError) -> Finding:
-    severities = {
-        UsdValidation.ValidationErrorType.Error: "error",
-        UsdValidation.ValidationErrorType.Warn: "warning",
-        UsdValidation.ValidationErrorType.Info: "info",
-    }
+    severity = next((name for name, kind in _severities().items() if kind == error.GetType()), "error")
     sites = [str(site.GetPrim().GetPath()) for site in error.GetSites() if site.IsValid() and site.GetPrim()]
-    return Finding(
-        severities.get(error.GetType(), "error"), error.GetName(), sites[0] if sites else "/", error.GetMessage()
-    )
+    return Finding(severity, error.GetName(), sites[0] if sites else "/", error.GetMessage())
 
 
 def find_nvidia_validator() -> Path | None:
