@@ -113,7 +113,7 @@ CHECKSUMS = "sha256"
 
 def record_checksums(layer: Sdf.Layer, folder: Path, names: Iterable[str]) -> None:
     """Write the checksums of files in a folder to an anonymous layer that will be saved in this folder."""
-    sums = {name: _sha256(folder / name) for name in names}
+    sums = {name: sha256_of(folder / name) for name in names}
     layer.customLayerData = {**layer.customLayerData, CHECKSUMS: sums}
 
 
@@ -130,7 +130,7 @@ def check_checksum(file: Path, wanted: str) -> None:
     Raises:
         RigError: The checksum does not match.
     """
-    if _sha256(file) != wanted:
+    if sha256_of(file) != wanted:
         raise RigError(
             "is damaged, or was changed after the rig was written: its checksum differs from the one in the rig.",
             path=file,
@@ -139,6 +139,7 @@ def check_checksum(file: Path, wanted: str) -> None:
         )
 
 
-def _sha256(file: Path) -> str:
+def sha256_of(file: Path) -> str:
+    """Return the SHA-256 of a file."""
     with file.open("rb") as opened:
         return hashlib.file_digest(opened, "sha256").hexdigest()

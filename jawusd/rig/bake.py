@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 from collections.abc import Iterable, Mapping
@@ -20,7 +19,7 @@ from jawusd.geometry.anatomy import LANDMARKS
 from jawusd.geometry.se3 import transform_points
 from jawusd.rig import layers, layout
 from jawusd.rig.animation import write_animation
-from jawusd.rig.asset_paths import record_checksums
+from jawusd.rig.asset_paths import record_checksums, sha256_of
 from jawusd.rig.attributes import write_arrays
 from jawusd.rig.geo import MESH_PATHS, build_geometry, check_meshes, extent, hide_look
 from jawusd.rig.onnx_sidecar import check_written, decode_model, encode_model, write_onnx
@@ -91,19 +90,15 @@ def add_detail_variants(actor: Sdf.PrimSpec, proxies: Iterable[str]) -> None:
     Args:
         proxies: Names of the meshes that have a proxy.
     """
-    variants = Sdf.VariantSetSpec(actor, layout.DETAIL)
-    Sdf.VariantSpec(variants, layout.SCAN)
+    variants = layers.add_variants(actor, layout.DETAIL, layout.SCAN, layout.PROXY, layout.BOTH).variants
     file = f"./{layout.PROXY_FILE}"
     for name, payload in ((layout.PROXY, Sdf.Payload(file)), (layout.BOTH, Sdf.Payload(file, _PROXY_CLASS))):
-        Sdf.VariantSpec(variants, name).primSpec.payloadList.prependedItems = [payload]
-    actor.variantSetNameList.prependedItems = [layout.DETAIL]
-    actor.variantSelections[layout.DETAIL] = layout.SCAN
+        variants[name].primSpec.payloadList.prependedItems = [payload]
     both = actor.path.AppendVariantSelection(layout.DETAIL, layout.BOTH)
     for name in proxies:
         scan = Sdf.CreatePrimInLayer(actor.layer, Sdf.Path(MESH_PATHS[name]).ReplacePrefix(actor.path, both))
         _set_purpose(scan, UsdGeom.Tokens.render)
-        relationship = Sdf.RelationshipSpec(scan, "proxyPrim", custom=False)
-        relationship.targetPathList.explicitItems = [Sdf.Path(_proxy_path(name))]
+        layers.set_relationship(scan, "proxyPrim", _proxy_path(name), custom=False)
 
 
 def _proxy_path(name: str) -> str:
@@ -112,8 +107,7 @@ def _proxy_path(name: str) -> str:
 
 
 def _set_purpose(prim: Sdf.PrimSpec, purpose: str) -> None:
-    attribute = Sdf.AttributeSpec(prim, "purpose", Sdf.ValueTypeNames.Token, Sdf.VariabilityUniform)
-    attribute.default = purpose
+    layers.set_attribute(prim, "purpose", _TYPES.Token, purpose, custom=False)
 
 
 def interface_layer(
@@ -129,13 +123,12 @@ def interface_layer(
         "name": name,
         "version": str(layout.FORMAT_VERSION),
     }
-    layers.apply_jaw_api(actor, "GeomModelAPI")
+    layers.apply_schemas(actor, layout.SCHEMA_NAME, "GeomModelAPI")
     actor.payloadList.prependedItems = [Sdf.Payload(f"./{layout.GEO_FILE}")]
     if names := list(proxies):
         add_detail_variants(actor, names)
-    hint = Sdf.AttributeSpec(actor, "extentsHint", _TYPES.Float3Array, Sdf.VariabilityVarying)
-    hint.default = layers.vec3f_array(motion_extent(rig, meshes))
-
+    box = layers.vec3f_array(motion_extent(rig, meshes))
+    layers.set_attribute(actor, "extentsHint", _TYPES.Float3Array, box, animated=True, custom=False)
     for parameter, limits in zip(layout.PARAMETERS, rig.d_range, strict=True):
         layers.set_attribute(actor, parameter, _TYPES.Double, 0.0, animated=True)
         layers.set_attribute(actor, f"{parameter}:range", _TYPES.Double2, layers.vec2d(limits))
@@ -149,16 +142,16 @@ def interface_layer(
         layers.set_attribute(actor, attribute, _TYPES.Asset, Sdf.AssetPath(f"./{file}"))
     layers.set_attribute(actor, "jaw:landmarks:names", _TYPES.TokenArray, Vt.TokenArray(list(LANDMARKS)))
     write_arrays(actor, rig, _INTERFACE_ARRAYS)
-    layers.set_relationship(actor, "jaw:skull", [layout.SKULL])
-    layers.set_relationship(actor, "jaw:mandible", [layout.MANDIBLE])
+    layers.set_relationship(actor, "jaw:skull", layout.SKULL)
+    layers.set_relationship(actor, "jaw:mandible", layout.MANDIBLE)
     return layer
 
 
 def record_sidecars(layer: Sdf.Layer, folder: Path) -> None:
     """Record the SHA-256 checksums of the ONNX files in `actor.usda`, as custom data."""
     for attribute, file in zip(layout.ONNX_ATTRIBUTES, (layout.ONNX_FILE, layout.ENCODE_FILE), strict=True):
-        found = hashlib.sha256((folder / file).read_bytes()).hexdigest()
-        layer.GetAttributeAtPath(f"{layout.ACTOR}.{attribute}").customData = {layout.SIDECAR_HASH_KEY: found}
+        hashes = {layout.SIDECAR_HASH_KEY: sha256_of(folder / file)}
+        layer.GetAttributeAtPath(f"{layout.ACTOR}.{attribute}").customData = hashes
 
 
 def decoder_layer(rig: JawRig, table: DecoderTable) -> Sdf.Layer:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import os
 import re
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TypeVar
 
@@ -23,7 +23,7 @@ from jawusd.base.inputs import check_path
 from jawusd.base.version import __version__
 from jawusd.formats.atomic import atomic_path
 from jawusd.geometry.so3 import continuous_wxyz
-from jawusd.rig.layout import ACTOR, PROXY_SUFFIX, SCHEMA_NAME
+from jawusd.rig.layout import ACTOR, PROXY_SUFFIX
 
 
 def double_array(values: ArrayLike) -> Vt.DoubleArray:
@@ -170,26 +170,43 @@ def define_prim(layer: Sdf.Layer, path: str, type_name: str) -> Sdf.PrimSpec:
     return spec
 
 
-def apply_jaw_api(spec: Sdf.PrimSpec, *others: str) -> None:
-    """Apply JawRigAPI and other schemas to a prim spec, as plain metadata: the schema plugin is not needed."""
+def apply_schemas(spec: Sdf.PrimSpec, *names: str) -> None:
+    """Apply schemas to a prim spec, as plain metadata: the schema plugin is not needed."""
     schemas = Sdf.TokenListOp()
-    schemas.prependedItems = [SCHEMA_NAME, *others]
+    schemas.prependedItems = list(names)
     spec.SetInfo("apiSchemas", schemas)
 
 
 def set_attribute(
-    spec: Sdf.PrimSpec, name: str, type_name: Sdf.ValueTypeName, value: object, *, animated: bool = False
-) -> None:
+    spec: Sdf.PrimSpec,
+    name: str,
+    type_name: Sdf.ValueTypeName,
+    value: object,
+    *,
+    animated: bool = False,
+    custom: bool = True,
+) -> Sdf.AttributeSpec:
     """Write an attribute with its default value, uniform unless animated; Blender imports only `custom` attributes."""
     variability = Sdf.VariabilityVarying if animated else Sdf.VariabilityUniform
-    attribute = Sdf.AttributeSpec(spec, name, type_name, variability, declaresCustom=True)
+    attribute = Sdf.AttributeSpec(spec, name, type_name, variability, declaresCustom=custom)
     attribute.default = value
+    return attribute
 
 
-def set_relationship(spec: Sdf.PrimSpec, name: str, targets: Iterable[str]) -> None:
-    """Write a relationship to prims."""
-    relationship = Sdf.RelationshipSpec(spec, name, custom=True)
-    relationship.targetPathList.explicitItems = [Sdf.Path(target) for target in targets]
+def set_relationship(spec: Sdf.PrimSpec, name: str, target: str | Sdf.Path, *, custom: bool = True) -> None:
+    """Write a relationship to a prim."""
+    relationship = Sdf.RelationshipSpec(spec, name, custom=custom)
+    relationship.targetPathList.explicitItems = [Sdf.Path(target)]
+
+
+def add_variants(actor: Sdf.PrimSpec, name: str, selected: str, *others: str) -> Sdf.VariantSetSpec:
+    """Add a variant set with empty variants to a prim spec, and select one."""
+    variants = Sdf.VariantSetSpec(actor, name)
+    for variant in (selected, *others):
+        Sdf.VariantSpec(variants, variant)
+    actor.variantSetNameList.prependedItems = [name]
+    actor.variantSelections[name] = selected
+    return variants
 
 
 def add_pose(prim: Usd.Prim, T: Array) -> None:

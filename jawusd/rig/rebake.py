@@ -17,7 +17,7 @@ from jawusd.base.errors import FormatError, RigError
 from jawusd.evaluator import JawRig
 from jawusd.rig.animation import author_motion, note_unseen
 from jawusd.rig.attributes import key_times
-from jawusd.rig.layers import new_layer, relative_path, write_layer
+from jawusd.rig.layers import new_layer, relative_path, set_attribute, write_layer
 from jawusd.rig.layout import MOTION, PARAMETERS, SKELETON, TRANSFORMS, rig_prims
 from jawusd.rig.motion_read import (
     BAKED_MM,
@@ -266,8 +266,8 @@ def _author(layer: Sdf.Layer, actor: Usd.Prim, motion: Rebaked, shot: object) ->
     paths = str(actor.GetPath()), str(mandible.GetPath())
     author_motion(layer, motion.rig, motion.times, motion.d, motion.times[[0, -1]], paths)
     moved = layer.GetPrimAtPath(mandible.GetPath())
-    order = Sdf.AttributeSpec(moved, "xformOpOrder", Sdf.ValueTypeNames.TokenArray, Sdf.VariabilityUniform)
-    order.default = Vt.TokenArray(["xformOp:translate", "xformOp:orient"])  # replaces any other transform ops
+    order = Vt.TokenArray(["xformOp:translate", "xformOp:orient"])  # replaces any other transform ops
+    set_attribute(moved, "xformOpOrder", Sdf.ValueTypeNames.TokenArray, order, custom=False)
     if bones_of(mandible) is not None:
         if actor.GetVariantSet(MOTION).GetVariantSelection() != SKELETON:
             raise RigError(

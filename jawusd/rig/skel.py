@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -76,11 +77,7 @@ def add_skeleton_variant(layer: Sdf.Layer, rig: JawRig, meshes: Iterable[str]) -
     SkelRoot, because a variant cannot change the type of the actor's prim, which `actor.usda` sets.
     """
     actor = Sdf.CreatePrimInLayer(layer, layout.ACTOR)
-    variants = Sdf.VariantSetSpec(actor, layout.MOTION)
-    Sdf.VariantSpec(variants, layout.TRANSFORMS)
-    Sdf.VariantSpec(variants, layout.SKELETON)
-    actor.variantSetNameList.prependedItems = [layout.MOTION]
-    actor.variantSelections[layout.MOTION] = layout.TRANSFORMS
+    layers.add_variants(actor, layout.MOTION, layout.TRANSFORMS, layout.SKELETON)
     inside = Sdf.Path(layout.ACTOR).AppendVariantSelection(layout.MOTION, layout.SKELETON)
 
     def in_variant(path: str) -> Sdf.Path:
@@ -142,10 +139,8 @@ def _define_motion(stage: Usd.Stage, rig: JawRig, frames: ArrayLike | None, d: A
 def _bind(layer: Sdf.Layer, rig: JawRig, meshes: Iterable[Sdf.Path], skeleton: Sdf.Path, mandible: Sdf.Path) -> None:
     """Bind the payload's meshes rigidly to the joints, those of the mandible to the jaw; the payload is not loaded."""
     # The bind transforms place the meshes. The empty op order keeps Blender from applying the payload's ops as well.
-    order = Sdf.AttributeSpec(
-        Sdf.CreatePrimInLayer(layer, mandible), "xformOpOrder", _TYPES.TokenArray, Sdf.VariabilityUniform
-    )
-    order.default = Vt.TokenArray()
+    moved = Sdf.CreatePrimInLayer(layer, mandible)
+    layers.set_attribute(moved, "xformOpOrder", _TYPES.TokenArray, Vt.TokenArray(), custom=False)
     for path in meshes:
         is_moving = path.HasPrefix(mandible)
         bind = rig.T_rest if is_moving else np.eye(4)
@@ -153,17 +148,13 @@ def _bind(layer: Sdf.Layer, rig: JawRig, meshes: Iterable[Sdf.Path], skeleton: S
 
 
 def _bind_mesh(mesh: Sdf.PrimSpec, skeleton: Sdf.Path, bind: Array, joint: int) -> None:
-    schemas = Sdf.TokenListOp()
-    schemas.prependedItems = ["SkelBindingAPI"]
-    mesh.SetInfo("apiSchemas", schemas)
-    relationship = Sdf.RelationshipSpec(mesh, "skel:skeleton", custom=False)
-    relationship.targetPathList.explicitItems = [skeleton]
-    matrix = Sdf.AttributeSpec(mesh, "primvars:skel:geomBindTransform", _TYPES.Matrix4d)
-    matrix.default = layers.row_matrix(bind)
+    layers.apply_schemas(mesh, "SkelBindingAPI")
+    layers.set_relationship(mesh, "skel:skeleton", skeleton, custom=False)
+    write = partial(layers.set_attribute, mesh, animated=True, custom=False)
+    write("primvars:skel:geomBindTransform", _TYPES.Matrix4d, layers.row_matrix(bind))
     values = (("jointIndices", _TYPES.IntArray, Vt.IntArray([joint])), ("jointWeights", _TYPES.FloatArray, [1.0]))
     for name, type_name, value in values:
-        primvar = Sdf.AttributeSpec(mesh, f"primvars:skel:{name}", type_name)
-        primvar.default = value
+        primvar = write(f"primvars:skel:{name}", type_name, value)
         primvar.SetInfo("interpolation", "constant")
         primvar.SetInfo("elementSize", 1)
 
