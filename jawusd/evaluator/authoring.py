@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from jawusd.base.arrays import Array
 from jawusd.evaluator.arrays import RigArrays
 from jawusd.evaluator.batching import as_floats, as_keys, as_rows, in_chunks, pairs_in_chunks
-from jawusd.evaluator.bounds import Ranges, SliceHull, denormalized, normalized
+from jawusd.evaluator.bounds import SMALLEST_REACH_MM, Ranges, SliceHull
 from jawusd.evaluator.clamping import Inside, kept_inside
 from jawusd.evaluator.curves import HermiteCurve, interpolate_linear
 from jawusd.evaluator.search import nearest_distance
@@ -155,12 +155,25 @@ class RigAuthoring(RigArrays):
         path at that opening (at least 0.5 mm).
         """
         rows, batch = as_rows(d, (3,), "d")
-        return in_chunks(lambda d: normalized(self.bound, self.d_range, d), rows).reshape(*batch, 3)
+        return in_chunks(lambda d: d / self._reach_mm(d[:, 0], d), rows).reshape(*batch, 3)
 
     def denormalized(self, shares: ArrayLike) -> Array:
         """Return the jaw parameters [mm], shape (..., 3), of fractions (..., 3): the inverse of `normalized`."""
         rows, batch = as_rows(shares, (3,), "shares")
-        return in_chunks(lambda n: denormalized(self.bound, self.d_range, n), rows).reshape(*batch, 3)
+        full_mm = self.d_range[0, 1]
+        return in_chunks(lambda n: n * self._reach_mm(n[:, 0] * full_mm, n), rows).reshape(*batch, 3)
+
+    def _reach_mm(self, d1: Array, sides: Array) -> Array:
+        """Return the ranges (n, 3) [mm] at openings d1 (n,), on the sides given by the signs of ``sides`` (n, 3)."""
+        on_path = np.zeros((len(d1), 3))
+        on_path[:, 0] = np.clip(d1, self.bound.first_mm, self.bound.last_mm)
+        scale = np.full((len(d1), 3), self.d_range[0, 1])
+        for axis in (1, 2):
+            low, high = self.bound.chord(on_path, axis)
+            reach = np.where(sides[:, axis] < 0, -low, high)
+            scale[:, axis] = np.where(reach > SMALLEST_REACH_MM, reach, SMALLEST_REACH_MM)
+        scale[np.isnan(d1)] = np.nan
+        return scale
 
     def captured_distance(self, d: ArrayLike) -> Array:
         """Return the distance (...) [mm] from d (..., 3) to the d of the nearest captured pose; inf if none."""

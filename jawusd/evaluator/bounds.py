@@ -14,16 +14,17 @@ is two outlines, in (d1, d2) and in (d1, d3), both of which must contain d (Yang
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
 
 from jawusd.base.arrays import Array, Mask
-from jawusd.evaluator.curves import HermiteCurve, flat_ended
+from jawusd.evaluator.curves import flat_ended
 from jawusd.evaluator.formula import BoundFormula
 
 _ARRAYS = ("slice_d1", "slice_directions", "slice_support", "slice_softness_mm", "slice_margin_mm")
+# Minimum length of a range [mm]; keeps the normalisation invertible where a section shrinks to a point.
+SMALLEST_REACH_MM = 0.5
 _NEWTON_ITERATIONS = 60
 _ROOT_TOLERANCE_MM = 1e-12
 _CANDIDATE_SLICES = 48
@@ -31,42 +32,29 @@ _CANDIDATE_SLICES = 48
 _CANDIDATE_RADII = (0.4, 0.75, 0.9, 0.97, 1.0)
 
 
-@dataclass(frozen=True, eq=False)
 class SliceHull:
-    """The slice hull of a rig."""
+    """The slice hull of a rig.
 
-    supports: HermiteCurve  # h_k(d1) [mm], constant outside the captured openings
-    directions: Array  # unit normals n_k in (d2, d3) around the full circle, shape (K, 2)
-    softness_mm: float  # radius of the rounded edges between half-spaces
-    offset_mm: float  # distance by which the bound extends beyond its supports
-    formula: BoundFormula  # the same bound for one d, evaluated in Python floats
-    #: derivatives of v_k, v_low and v_high with respect to d, shape (K + 2, 3), without the d1 derivatives of v_k,
-    #: which depend on d1 and are 0 here
-    slopes: Array = field(init=False, repr=False)
-    first_mm: float = field(init=False, repr=False)  # smallest captured opening
-    last_mm: float = field(init=False, repr=False)  # largest captured opening
+    Attributes:
+        supports: h_k(d1) [mm], constant outside the captured openings.
+        directions: Unit normals n_k in (d2, d3) around the full circle, shape (K, 2).
+        softness_mm: Radius of the rounded edges between half-spaces.
+        offset_mm: Distance by which the bound extends beyond its supports.
+        first_mm, last_mm: Smallest and largest captured opening.
+        slopes: Derivatives of v_k, v_low and v_high by d, shape (K + 2, 3); 0 for v_k by d1, which depend on d1.
+        formula: The same bound for one d, evaluated in Python floats.
+    """
 
-    def __post_init__(self) -> None:
-        # the K rows of v_k (their d1 column, -h_k', is added during evaluation), then v_low and v_high
-        gradients = np.zeros((len(self.directions) + 2, 3))
-        gradients[:-2, 1:] = self.directions
-        gradients[-2:, 0] = -1.0, 1.0
-        object.__setattr__(self, "slopes", gradients)
-        object.__setattr__(self, "first_mm", float(self.supports.knots[0]))
-        object.__setattr__(self, "last_mm", float(self.supports.knots[-1]))
-
-    @classmethod
-    def from_arrays(cls, arrays: Mapping[str, Array]) -> SliceHull:
+    def __init__(self, arrays: Mapping[str, Array]) -> None:
         """Build the bound from the named arrays of a rig."""
         knots = np.asarray(arrays["slice_d1"], dtype=float)
-        values = np.asarray(arrays["slice_support"], dtype=float)
-        return cls(
-            supports=flat_ended(knots, values),
-            directions=np.asarray(arrays["slice_directions"], dtype=float),
-            softness_mm=float(arrays["slice_softness_mm"]),
-            offset_mm=float(arrays["slice_margin_mm"]),
-            formula=BoundFormula({name: np.ravel(arrays[name]).tolist() for name in _ARRAYS}),
-        )
+        self.supports = flat_ended(knots, np.asarray(arrays["slice_support"], dtype=float))
+        self.directions = np.asarray(arrays["slice_directions"], dtype=float)
+        self.softness_mm, self.offset_mm = float(arrays["slice_softness_mm"]), float(arrays["slice_margin_mm"])
+        self.first_mm, self.last_mm = float(knots[0]), float(knots[-1])
+        self.slopes = np.zeros((len(self.directions) + 2, 3))
+        self.slopes[:-2, 1:], self.slopes[-2:, 0] = self.directions, (-1.0, 1.0)
+        self.formula = BoundFormula({name: np.ravel(arrays[name]).tolist() for name in _ARRAYS})
 
     def signed_distance(self, d: Array) -> Array:
         """Return the signed distance (n,) of d (n, 3) to the bound [mm]; negative inside."""
@@ -143,28 +131,26 @@ class SliceHull:
 
     def section_centres(self, count: int) -> tuple[Array, Array]:
         """Return up to ``count`` openings (n,) [mm] within the bound, and the centres (n, 2) [mm] of the sections."""
-        reach = self.offset_mm - self.softness_mm
-        found = [
-            (d1, self._sharp_outline(d1)) for d1 in np.linspace(self.first_mm - reach, self.last_mm + reach, count)
-        ]
-        known = [(d1, outline.mean(axis=0)) for d1, outline in found if len(outline)]
+        known = [(d1, outline.mean(axis=0)) for d1, outline in self._sharp_outlines(count)]
         return np.array([d1 for d1, _ in known]), np.array([middle for _, middle in known]).reshape(-1, 2)
 
     def candidates(self) -> Array:
         """Return starting points (n, 3) [mm] of searches, spread over the valid volume and denser near its surface."""
-        reach = self.offset_mm - self.softness_mm  # because of the rounding, sections shrink to points at both ends
-        low, high = self.first_mm - reach, self.last_mm + reach
         points = []
-        for d1 in np.linspace(low, high, _CANDIDATE_SLICES):
-            outline = self._sharp_outline(d1)
-            if not len(outline):
-                continue
+        for d1, outline in self._sharp_outlines(_CANDIDATE_SLICES):
             centre = outline.mean(axis=0)
             reach = np.concatenate([outline, 0.5 * (outline + np.roll(outline, 1, axis=0))]) - centre
             section = np.concatenate([[centre], *(centre + radius * reach for radius in _CANDIDATE_RADII)])
             points.append(np.column_stack([np.full(len(section), d1), section]))
         found = np.concatenate([np.empty((0, 3)), *points])
         return found[self.signed_distance(found) <= 0]
+
+    def _sharp_outlines(self, count: int) -> list[tuple[float, Array]]:
+        """Return openings and the outlines (n, 2) of their unrounded sections that are not empty."""
+        reach = self.offset_mm - self.softness_mm  # because of the rounding, sections shrink to points at both ends
+        openings = np.linspace(self.first_mm - reach, self.last_mm + reach, count)
+        found = [(d1, self._sharp_outline(d1)) for d1 in openings]
+        return [(d1, outline) for d1, outline in found if len(outline)]
 
     def _sharp_outline(self, d1: float) -> Array:
         """Return the corners (n, 2) of the section's unrounded polygon at d1, in order of angle."""
@@ -207,10 +193,6 @@ def largest_share(outside: Callable[[Array], Mask], count: int, iterations: int)
     return low
 
 
-# Minimum length of a range [mm]; keeps the normalisation invertible where a section shrinks to a point.
-SMALLEST_REACH_MM = 0.5
-
-
 class Ranges(NamedTuple):
     """Valid ranges of d2 and d3 [mm], each varied alone, shape (...); NaN where empty."""
 
@@ -220,44 +202,14 @@ class Ranges(NamedTuple):
     d3_max: Array
 
 
-def normalized(bound: SliceHull, d_range: Array, d: Array) -> Array:
-    """Return d (n, 3) [mm] as fractions of the full opening (d1) and of the ranges on their sides at d1 (d2, d3)."""
-    return d / _scale(bound, d_range, d[:, 0], d)
-
-
-def denormalized(bound: SliceHull, d_range: Array, shares: Array) -> Array:
-    """Return the d (n, 3) [mm] of fractions (n, 3); the inverse of `normalized`."""
-    return shares * _scale(bound, d_range, shares[:, 0] * d_range[0, 1], shares)
-
-
-def _scale(bound: SliceHull, d_range: Array, d1: Array, sides: Array) -> Array:
-    """Return the ranges (n, 3) [mm] at openings d1 (n,), on the sides given by the signs of ``sides`` (n, 3)."""
-    knots = bound.supports.knots
-    on_path = np.zeros((len(d1), 3))
-    on_path[:, 0] = np.clip(d1, knots[0], knots[-1])
-    scale = np.full((len(d1), 3), d_range[0, 1])
-    for axis in (1, 2):
-        low, high = bound.chord(on_path, axis)
-        reach = np.where(sides[:, axis] < 0, -low, high)
-        scale[:, axis] = np.where(reach > SMALLEST_REACH_MM, reach, SMALLEST_REACH_MM)
-    scale[np.isnan(d1)] = np.nan
-    return scale
-
-
-@dataclass(frozen=True)
 class PolygonBound:
     """The bound of the paper: two alpha shapes."""
 
-    opening_lateral: Array  # edges of the outlines in (d1, d2) [mm], each as its start and end point, shape (e, 2, 2)
-    opening_protrusion: Array  # edges of the outlines in (d1, d3) [mm], likewise, shape (f, 2, 2)
-
-    @classmethod
-    def from_arrays(cls, arrays: Mapping[str, Array]) -> PolygonBound:
+    def __init__(self, arrays: Mapping[str, Array]) -> None:
         """Build the bound from the named arrays of a rig."""
-        return cls(
-            _edges(arrays["polygon_d1d2"], arrays["polygon_d1d2_counts"]),
-            _edges(arrays["polygon_d1d3"], arrays["polygon_d1d3_counts"]),
-        )
+        # edges (e, 2, 2) of the outlines in (d1, d2) and in (d1, d3) [mm], each as its start and end point
+        self.opening_lateral = _edges(arrays["polygon_d1d2"], arrays["polygon_d1d2_counts"])
+        self.opening_protrusion = _edges(arrays["polygon_d1d3"], arrays["polygon_d1d3_counts"])
 
     def signed_distance(self, d: Array) -> Array:
         """Return the larger of the signed distances (n,) [mm] of d (n, 3) to the two outlines; negative inside both."""

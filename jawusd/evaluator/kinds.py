@@ -72,31 +72,21 @@ def _clearance_arrays(prefix: str, namespace: str, size: str) -> dict[str, Array
     }
 
 
-#: Arrays of the clearance of the teeth, all present or none; see `jawusd.evaluator.contact`.
-CONTACT_ARRAYS = _clearance_arrays("contact", "jaw:contact", "clearances")
-
-#: Arrays of the clearance between condyles and skull, for rigs with scanned bones, all present or none.
-JOINT_ARRAYS = _clearance_arrays("joint", "jaw:joints", "joint clearances")
-
-#: Arrays of the speeds in a take with a known frame rate, both present or both absent; see `jawusd.evaluator.speeds`.
-SPEED_ARRAYS: dict[str, ArraySpec] = {
-    "velocity_covariance": ArraySpec("jaw:motion:velocityCovariance", (3, 3)),
-    "acceleration_covariance": ArraySpec("jaw:motion:accelerationCovariance", (3, 3)),
-}
-
-#: Distances of frames from a bound built without them, both arrays present or both absent; see
-#: `jawusd.evaluator.arrays.HeldOut`.
+#: Distances of frames from a bound built without them; see `jawusd.evaluator.arrays.HeldOut`.
 HELD_OUT_ARRAYS: dict[str, ArraySpec] = {
     "held_out_share": ArraySpec("jaw:thresholds:heldOutShare"),
     "held_out_p95_mm": ArraySpec("jaw:thresholds:heldOutP95"),
 }
 
-
-#: Optional groups of arrays of any kind of model, each keyed by the name of one of its arrays.
+#: Optional groups of arrays of any kind of model, all present or none, each keyed by the name of one of its arrays: the
+#: clearance of the teeth, that of the condyles for rigs with scanned bones, speeds, and distances of held-out frames.
 COMMON_OPTIONAL = {
-    "contact_values": CONTACT_ARRAYS,
-    "joint_values": JOINT_ARRAYS,
-    "velocity_covariance": SPEED_ARRAYS,
+    "contact_values": _clearance_arrays("contact", "jaw:contact", "clearances"),
+    "joint_values": _clearance_arrays("joint", "jaw:joints", "joint clearances"),
+    "velocity_covariance": {
+        "velocity_covariance": ArraySpec("jaw:motion:velocityCovariance", (3, 3)),
+        "acceleration_covariance": ArraySpec("jaw:motion:accelerationCovariance", (3, 3)),
+    },
     "held_out_share": HELD_OUT_ARRAYS,
 }
 

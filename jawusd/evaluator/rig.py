@@ -73,8 +73,8 @@ class JawRig(RigJudging, RigAuthoring):
         """
         super().__init__(arrays, meta)
         self.model = FORMS[self.kind](self.arrays)
-        self.bound = SliceHull.from_arrays(self.arrays)
-        self.polygons = PolygonBound.from_arrays(self.arrays)
+        self.bound = SliceHull(self.arrays)
+        self.polygons = PolygonBound(self.arrays)
         self.contact = ContactField.from_arrays(self.arrays, "teeth")
         self.joints = ContactField.from_arrays(self.arrays, "condyles")
         self.speeds = Speeds.from_arrays(self.arrays)

@@ -104,9 +104,7 @@ def fit_slice_hull(d: Array, closed_mm: float | None = None) -> tuple[dict[str, 
         shows.
     """
     blocks = np.arange(len(d)) // min(_BLOCK, max(1, len(d) // _FOLDS)) % _FOLDS
-    excess = [
-        SliceHull.from_arrays(_hull(d[blocks != k], closed_mm)).signed_distance(d[blocks == k]) for k in range(_FOLDS)
-    ]
+    excess = [SliceHull(_hull(d[blocks != k], closed_mm)).signed_distance(d[blocks == k]) for k in range(_FOLDS)]
     excess_mm = np.maximum(np.concatenate(excess), 0.0)
     p95_mm = np.quantile(excess_mm, _TOLERANCE_QUANTILE)
     tolerance_mm = np.minimum(p95_mm, _LARGEST_TOLERANCE_MM)

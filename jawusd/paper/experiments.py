@@ -55,8 +55,8 @@ class Bounds:
         lateral, protrusive = (tuple(np.split(shapes[name], shapes[f"{name}_counts"].cumsum()[:-1])) for name in PLANES)
         hull, _ = fit_slice_hull(d)
         box = np.stack([d.min(0), d.max(0)], axis=1)
-        polygons = PolygonBound.from_arrays(shapes)
-        return cls(box, polygons, (lateral, protrusive), SliceHull.from_arrays(hull), valid_box(hull))
+        polygons = PolygonBound(shapes)
+        return cls(box, polygons, (lateral, protrusive), SliceHull(hull), valid_box(hull))
 
     def draw(self, rng: np.random.Generator) -> dict[str, Array]:
         """Return up to `POSES` uniformly distributed parameters (n, 3) [mm] within each bound, keyed by its name."""

@@ -63,7 +63,7 @@ class Hull(Formula):
         formula = BoundFormula(flat_arrays(arrays))
         super().__init__(formula.tables, formula.numbers)
         self._formula = formula
-        points = SliceHull.from_arrays(arrays).candidates()
+        points = SliceHull(arrays).candidates()
         if not len(points):
             raise EvaluatorError(
                 "the bound of this rig leaves no valid jaw parameters.", hint="Fit the model again with a wider margin."

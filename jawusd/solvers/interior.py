@@ -36,7 +36,7 @@ class Interior(Formula):
     """
 
     def __init__(self, arrays: Mapping[str, Array]) -> None:
-        bound = SliceHull.from_arrays(arrays)
+        bound = SliceHull(arrays)
         knots, middles = bound.supports.knots, _middles(bound)
         line = flat_ended(knots, middles)
         tables = curve_tables("middle", knots.tolist(), middles.tolist(), line.slopes.tolist())

@@ -257,7 +257,7 @@ def envelope(rng, count):
 def test_slice_hull_contains_the_captured_and_rejects_the_far():
     rng = np.random.default_rng(19)
     arrays, _ = fit_slice_hull(envelope(rng, 1200))
-    bound = SliceHull.from_arrays(arrays)
+    bound = SliceHull(arrays)
     assert (bound.signed_distance(envelope(rng, 2000)) < 0).mean() > 0.95
     outside = envelope(rng, 2000)
     outside[:, 1:] = (outside[:, 1:] - [0, 2]) / np.linalg.norm((outside[:, 1:] - [0, 2]) / [10, 6], axis=1)[:, None]
@@ -272,7 +272,7 @@ def test_box_contains_everything_within_the_bound():
     box = valid_box(arrays)
     wide = box + np.array([-5.0, 5.0])
     d = wide[:, 0] + (wide[:, 1] - wide[:, 0]) * rng.random((20000, 3))
-    d = d[SliceHull.from_arrays(arrays).signed_distance(d) < 0]
+    d = d[SliceHull(arrays).signed_distance(d) < 0]
     assert len(d) > 500
     assert (d >= box[:, 0]).all() and (d <= box[:, 1]).all()
 
@@ -294,7 +294,7 @@ def test_share_of_held_out_frames_states_what_the_largest_tolerance_leaves_out()
     blocks = np.arange(1000) // 50 % 5
     d[blocks == 4, 1:] *= 2.5
     _, found = fit_slice_hull(d)
-    hulls = [SliceHull.from_arrays(fit_slice_hull(d[blocks != k])[0]) for k in range(5)]
+    hulls = [SliceHull(fit_slice_hull(d[blocks != k])[0]) for k in range(5)]
     beyond_mm = np.concatenate([hull.signed_distance(d[blocks == k]) for k, hull in enumerate(hulls)])
     assert found["tolerance_mm"] == 1.0 and found["held_out_share"] == (beyond_mm <= 1.0).mean() < 0.9
     assert found["held_out_p95_mm"] == pytest.approx(np.quantile(beyond_mm, 0.95)) and found["held_out_p95_mm"] > 1.0
@@ -303,4 +303,4 @@ def test_share_of_held_out_frames_states_what_the_largest_tolerance_leaves_out()
 def test_flat_section_still_contains_its_frames():
     d = np.zeros((100, 3))
     d[:, 0] = np.linspace(0, 40, 100)
-    assert (SliceHull.from_arrays(fit_slice_hull(d)[0]).signed_distance(d) < 0).all()
+    assert (SliceHull(fit_slice_hull(d)[0]).signed_distance(d) < 0).all()
