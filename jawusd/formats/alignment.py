@@ -39,14 +39,14 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from jawusd.base.arrays import Array
 from jawusd.base.errors import FormatError
 from jawusd.base.npz import read_arrays, take
 from jawusd.formats.atomic import write_text_atomic
 from jawusd.formats.poses import read_poses
-from jawusd.formats.text import parse_model, read_text
+from jawusd.formats.text import Strict, parse_model, read_text
 from jawusd.geometry import hat, make_transform, rigidity_defect, se3_inverse, so3_exp, transform_points
 
 _MAX_BYTES = 1 << 20
@@ -58,20 +58,16 @@ _Row = tuple[_Number, _Number, _Number, _Number]
 _Spread = tuple[_Number, _Number, _Number, _Number, _Number, _Number, _Number]
 
 
-class Correspondence(BaseModel):
+class Correspondence(Strict):
     """One point on a face model and on the rig."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     model: _Point = Field(description="three numbers [model units]")
     rig: _Point | None = Field(None, description="three numbers [mm]")
     sigma_mm: _Positive = Field(description="a number above 0 [mm]")
 
 
-class Correspondences(BaseModel):
+class Correspondences(Strict):
     """Content of a file of corresponding points."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     format: Literal["jawusd-correspondences/1"] = Field(
         "jawusd-correspondences/1", description='"jawusd-correspondences/1"'
@@ -82,10 +78,8 @@ class Correspondences(BaseModel):
     joint: _Point | None = Field(None, description="three numbers [model units]")
 
 
-class Alignment(BaseModel):
+class Alignment(Strict):
     """The alignment of a face model with a rig, with its expected error."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     format: Literal["jawusd-alignment/1"] = Field("jawusd-alignment/1", description='"jawusd-alignment/1"')
     actor: str = Field(description="the actor's name")

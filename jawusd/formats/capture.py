@@ -12,8 +12,8 @@ from pydantic import Field, ValidationError, field_validator, model_validator
 from jawusd.base.errors import FormatError, JawusdError, UnitsError
 from jawusd.base.npz import check_format
 from jawusd.formats.capture_keys import Key, KeyEntry, entries, problems_of
-from jawusd.formats.capture_parts import Boards, CameraSource, Scans, Strict, resolve_paths, similar_names
-from jawusd.formats.text import read_toml
+from jawusd.formats.capture_parts import Boards, CameraSource, Scans, resolve_paths, similar_names
+from jawusd.formats.text import Strict, read_toml
 from jawusd.geometry import rigidity_defect
 
 FAMILY, VERSION = "jawusd-capture", 1

@@ -9,18 +9,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Literal, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, Field, model_validator
 
 from jawusd.base.errors import CaptureError, JawusdError
 from jawusd.formats.capture_keys import Key, Location, place
 from jawusd.formats.clips import ClipSource
 from jawusd.formats.file_names import is_pattern, wrong_kind
-
-
-class Strict(BaseModel):
-    """Base class of all tables: immutable, and unknown keys are errors."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, arbitrary_types_allowed=True, populate_by_name=True)
+from jawusd.formats.text import Strict
 
 
 class Scans(Strict):

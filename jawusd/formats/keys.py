@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from jawusd.base.arrays import Array
 from jawusd.base.tables import read_text
 from jawusd.formats.atomic import write_text_atomic
-from jawusd.formats.text import parse_model
+from jawusd.formats.text import Strict, parse_model
 
 #: Maximum number of frames, all of which are baked (an hour at 60 frames per second), and maximum frame number.
 MOST_FRAMES, FARTHEST_FRAME = 220_000, 1e9
@@ -26,10 +26,8 @@ Finite = Annotated[float, Field(allow_inf_nan=False)]
 _Parameter = Annotated[float, Field(allow_inf_nan=False, ge=-FARTHEST_MM, le=FARTHEST_MM)]
 
 
-class Key(BaseModel):
+class Key(Strict):
     """Animation key: the jaw parameters d [mm] at one frame, and optionally their slopes."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     frame: Finite = Field(description="a number")
     d: tuple[_Parameter, _Parameter, _Parameter] = Field(
@@ -43,10 +41,8 @@ class Key(BaseModel):
     )
 
 
-class Keys(BaseModel):
+class Keys(Strict):
     """Animation with keys at strictly increasing frames, at `fps` frames per second."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     fps: float = Field(gt=0, le=10000, allow_inf_nan=False, description="a number above 0, at most 10000 [1/s]")
     interpolation: Literal["linear", "smooth"] = Field("linear", description='"linear" or "smooth"')

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 from jawusd.base.arrays import Array
 from jawusd.formats.atomic import write_text_atomic
@@ -37,21 +37,14 @@ class AlignedPhoto:
     def as_json(self) -> dict[str, object]:
         """Return the fields as plain data for JSON."""
         u, v = self.middle_px.tolist()
-        return {
-            "name": self.name,
+        given: dict[str, object] = asdict(self)
+        del given["middle_px"], given["distortion"]
+        return given | {
             "size_px": list(self.size_px),
-            "mirrored": self.mirrored,
-            "focal_px": self.focal_px,
             "camera_matrix": [[self.focal_px, 0.0, u], [0.0, self.focal_px, v], [0.0, 0.0, 1.0]],
             "distortions": [self.distortion, 0.0, 0.0, 0.0, 0.0],
             "T_cam_upper": self.T_cam_upper.tolist(),
-            "outline_rms_px": self.outline_rms_px,
-            "outline_median_px": self.outline_median_px,
-            "free_rms_px": self.free_rms_px,
-            "misfit": self.misfit,
-            "other_hand": self.other_hand,
             "T_upper_lower_alone": self.T_upper_lower_alone.tolist(),
-            "alone_off_mm": self.alone_off_mm,
         }
 
 

@@ -9,13 +9,20 @@ import tomllib
 from pathlib import Path
 from typing import Annotated, TypeVar
 
-from pydantic import BaseModel, Field, TypeAdapter, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from jawusd.base.errors import FormatError
 from jawusd.base.tables import read_text
 from jawusd.formats.capture_keys import table_model
 
 Model = TypeVar("Model", bound=BaseModel)
+
+
+class Strict(BaseModel):
+    """Base class of the content of files: immutable, and unknown keys are errors."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, arbitrary_types_allowed=True, populate_by_name=True)
+
 
 _MOST_TOML_BYTES = 4 << 20
 _SHOWN = 80  # maximum length of a quoted line in messages [characters]
