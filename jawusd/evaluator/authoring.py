@@ -115,18 +115,10 @@ class RigAuthoring(RigArrays):
         return d.reshape(*batch, 3)
 
     def keep_inside(self, times: ArrayLike, d: ArrayLike) -> Inside:
-        """Return a motion clamped to the bound, both at its samples and on the straight lines between them.
+        """Return a motion, d (F, 3) [mm] at increasing times (F,), linear in between, clamped to the bound everywhere.
 
-        Poses outside the bound are moved inside continuously, and no step becomes more than 5 % longer than in the
-        given motion. Where the path inside the bound is too long for this limit, the motion just before and after it is
-        retimed as well.
-
-        Args:
-            times: Increasing sample times, shape (F,).
-            d: Jaw parameters [mm], interpolated linearly, shape (F, 3).
-
-        Returns:
-            The samples at the given times, and additional ones where straight lines between them would leave the bound.
+        Poses outside the bound are moved inside continuously, and no step becomes more than 5 % longer. Where the path
+        inside is too long for this limit, the motion just before and after it is retimed as well.
 
         Raises:
             ValueError: wrong shapes, samples that are not finite, or times that do not increase.

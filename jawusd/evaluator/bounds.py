@@ -89,10 +89,7 @@ class SliceHull:
         return self._chord_end(d, axis, -1.0), self._chord_end(d, axis, 1.0)
 
     def nearest_opening(self, d: Array) -> Array:
-        """Return d (n, 3) [mm] with openings beyond the ends of the bound moved to the nearest valid opening.
-
-        Rows that would not lie inside at the first or last opening are unchanged.
-        """
+        """Return d (n, 3) [mm] with openings beyond the ends moved to the nearest valid one, if that is inside."""
         inner = d.copy()
         inner[:, 0] = np.clip(d[:, 0], self.first_mm, self.last_mm)
         closed = self.signed_distance(d) > 0

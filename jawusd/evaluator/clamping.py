@@ -47,13 +47,9 @@ class Inside(NamedTuple):
 
 
 def kept_inside(bound: SliceHull, times: Array, d: Array, *, ends_stay: bool = False) -> Inside:
-    """Return a motion clamped to the bound, also between its samples, with no step more than 5 % longer than before.
+    """Return a motion d (F, 3) [mm] clamped to the bound, also between its samples, with no step more than 5 % longer.
 
-    Args:
-        times: Increasing times, shape (F,).
-        d: Jaw parameters [mm], finite, linear between the times, shape (F, 3).
-        ends_stay: Where every path inside is too long, exceed the speed limit instead of retiming the motion before and
-            after.
+    `ends_stay`: where every path inside is too long, exceed this limit instead of retiming the motion before and after.
 
     Raises:
         EvaluatorError: the bound is empty.

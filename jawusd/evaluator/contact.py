@@ -1,8 +1,7 @@
 """Clearance: how far teeth, or condyles and skull, are from penetrating deeper than in the closed bite.
 
-The clearance is the penetration depth of the closed bite minus that of the pose, sampled from the scans on a grid over
-d when the rig is built. Interpolation is trilinear; outside the grid, where the mouth is open, the nearest value is
-used.
+It is sampled from the scans on a grid over d when the rig is built, and interpolated trilinearly; outside the grid,
+where the mouth is open, the nearest value is used.
 """
 
 from __future__ import annotations
@@ -160,8 +159,7 @@ class RigClearance:
     def clearance(self, d: ArrayLike, *, of: Meeting = "teeth") -> Clearance:
         """Return how far the teeth, or the condyles and the skull, are from penetrating deeper than in the closed bite.
 
-        It is 0 for the teeth in the closed bite, saturates at about 1.5 mm and is constant far outside the bound; d
-        (..., 3) [mm].
+        It is 0 for the teeth in the closed bite, saturates at about 1.5 mm and is constant far outside the bound.
 
         Raises:
             EvaluatorError: The rig has no such clearance; see `contact` and `joints`.

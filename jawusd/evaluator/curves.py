@@ -1,7 +1,4 @@
-"""Piecewise cubic curves with given values and slopes, and the tooth-glide surface, a sum of products of two curves.
-
-Additive models and bounds consist of such curves.
-"""
+"""Piecewise cubic curves with given values and slopes, and the tooth-glide surface, a sum of products of two curves."""
 
 from __future__ import annotations
 

@@ -91,11 +91,7 @@ class Handles(NamedTuple):
         return values - np.einsum("am,nm...->nam...", self.sight, along)
 
     def features(self, images: Array, d: Array) -> Array:
-        """Return the features: images (n, 3, m) [mm] without depth, then the depths from d (n, 3) [mm].
-
-        Returns:
-            Features [mm], shape (n, 3 m), or (n, 4 m) if `sight` is given.
-        """
+        """Return images (n, 3, m) [mm] without depth and, with `sight`, the depths of d: (n, 3 m) or (n, 4 m)."""
         seen = self.across(images).reshape(len(images), 3 * self.vectors.shape[1])
         return seen if self.sight is None else np.concatenate([seen, d @ self.depths.T], axis=1)
 

@@ -205,10 +205,7 @@ class BoundFormula:
         return offset_mm - softness_mm * ops.log_sum_exp(terms)
 
     def middle(self, d1: float) -> tuple[float, float]:
-        """Return d2, d3 [mm] in the middle of the section at an opening d1 [mm], by least squares over the supports.
-
-        For evenly spaced directions it is the section's Steiner point, which lies inside.
-        """
+        """Return d2, d3 [mm] in the middle of the section at d1 [mm]: the Steiner point of evenly spaced directions."""
         reach = curve("support", d1, self.tables, FloatOperations())
         xx = xy = yy = hx = hy = 0.0
         for (x, y), h in zip(self.tables["directions"], reach):

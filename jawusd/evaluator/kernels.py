@@ -97,15 +97,7 @@ class NumpyKernels:
         return judge(finite, np.ones_like(finite), np.where(finite, 0.0, np.nan), self.margins(d), d, limits)
 
     def approach(self, wanted: Array, start: Array) -> tuple[Array, Array]:
-        """Search inside the bound for the parameters nearest to given ones.
-
-        Args:
-            wanted: Given d [mm], shape (n, 3).
-            start: Initial d [mm] inside the bound, shape (n, 3).
-
-        Returns:
-            The local minima (n, 3) [mm] around the starts, and the squared distances (n,).
-        """
+        """Return d (n, 3) [mm] inside the bound nearest to `wanted`, around valid starts, and squared distances."""
         if len(start) <= _FEW_ROWS:
             pairs = zip(wanted.tolist(), start.tolist())
             each = [nearest_in_valley(self._bound.formula, triple(to), triple(x)) for to, x in pairs]

@@ -29,10 +29,9 @@ class Speeds:
 
     @classmethod
     def of_take(cls, d: ArrayLike, fps: float) -> Speeds:
-        """Estimate the speeds of a take, corrected for noise that is independent between frames.
+        """Estimate the speeds of consecutive frames d (F, 3) [mm], NaN if lost, corrected for independent noise.
 
-        The noise level is estimated from the median of fourth differences, where noise dominates motion; `d` (F, 3)
-        [mm] are consecutive frames, NaN if lost.
+        The noise level is estimated from the median of fourth differences, where noise dominates motion.
 
         Raises:
             ValueError: a wrong shape, a rate that is not positive, or too few consecutive frames.

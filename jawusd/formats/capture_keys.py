@@ -71,12 +71,9 @@ def describe_key(field: FieldInfo) -> Key:
 def entries(
     model: type[BaseModel], table: str = "", prefix: str = "", skipped: tuple[str, ...] = ()
 ) -> Iterator[KeyEntry]:
-    """Yield the keys of a model and of its nested tables, in file order.
+    """Yield the keys of a model and of its nested tables, in file order, without the `skipped` fields.
 
-    Args:
-        table: the table's header in the file.
-        prefix: prefix of keys that are written in the table above, such as "masks.".
-        skipped: fields that are not read from the file.
+    `table` is the model's header in the file, `prefix` that of keys written in the table above, such as "masks.".
     """
     inner: list[tuple[str, str, type[BaseModel]]] = []
     for field_name, field in model.model_fields.items():

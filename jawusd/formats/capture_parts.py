@@ -226,12 +226,9 @@ _RELATIVE = "Write it relative to the capture's folder, with slashes, such as vi
 def resolve_paths(
     model: M, source: Path, data: Mapping[str, object], *, allow_outside: bool
 ) -> tuple[M, list[JawusdError]]:
-    """Return a model with absolute paths, and an error for each path that is missing or outside the folder.
+    """Return a model with absolute paths, and an error for each path that is missing or outside the folder of `source`.
 
-    Args:
-        source: the file of the model; paths are relative to its folder.
-        data: content of the file, for the names of tables in messages.
-        allow_outside: whether paths outside the folder are allowed.
+    `data` is the content of the file, for the names of tables in messages.
 
     Raises:
         TypeError: the argument is not a model.

@@ -52,10 +52,7 @@ class Mesh:
 def without_loose(
     vertices: Array, faces: NDArray[np.int64] | NDArray[np.int32], colors: NDArray[np.uint8] | None
 ) -> tuple[Array, NDArray[np.uint8] | None]:
-    """Return vertices (V, 3) and colours after moving unused vertices onto used ones, evenly distributed.
-
-    Indices of picked vertices stay valid, and unused vertices do not affect sizes, centres and labels.
-    """
+    """Return vertices (V, 3) and colours with unused vertices moved onto used ones; picked indices stay valid."""
     used = np.zeros(len(vertices), bool)
     used[faces] = True
     loose, kept = np.flatnonzero(~used), np.flatnonzero(used)
@@ -89,10 +86,7 @@ def natural_colors(mesh: Mesh) -> NDArray[np.uint8] | None:
 
 
 def tooth_labels(mesh: Mesh) -> NDArray[np.uint8]:
-    """Return GUM, TOOTH or BOUNDARY for each vertex of a teeth scan, shape (V,); tooth labels are > 0.
-
-    The labels are those of the mesh, with the base as gum, or painted ones; without labels, every vertex is TOOTH.
-    """
+    """Return GUM (or base), TOOTH or BOUNDARY per vertex of a teeth scan, shape (V,); all TOOTH without labels."""
     if mesh.labels is not None:
         return np.where(mesh.labels == BASE, GUM, mesh.labels).astype(np.uint8)
     painted = painted_labels(mesh)
@@ -182,12 +176,8 @@ def cut_polygons(vertices: Array, counts: Indices, corners: Indices) -> tuple[In
     """Triangulate polygons as fans: return the positions (F, 3) of corners in `corners`, and vertices (F, 3).
 
     A fan starts at the first corner from which all triangles face the same way as the polygon, so that concave quads
-    are correct; polygons with fewer than three corners are dropped.
-
-    Args:
-        vertices: shape (V, 3).
-        counts: number of corners of each polygon, shape (P,).
-        corners: concatenated vertex indices of all polygons, shape (C,).
+    are correct; polygons with fewer than three corners are dropped. `counts` (P,) are the numbers of corners of each
+    polygon, `corners` (C,) the vertex indices of all.
     """
     starts = np.cumsum(counts) - counts
     triangles, owners = [], []

@@ -1,7 +1,6 @@
 """Read and write the fitted jaw model: `model.npz`, format jawusd-model/2.
 
-The decoder arrays (`JawModel.arrays`) have the same names in this file, in the rig and in the evaluator. The evaluator
-validates them on construction; this module validates only the additional arrays.
+The decoder arrays (`JawModel.arrays`) have the names of the evaluator, which validates them on construction.
 """
 
 from __future__ import annotations

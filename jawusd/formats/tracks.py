@@ -253,9 +253,7 @@ def worst_frames(
 ) -> list[int]:
     """Return indices of the frames with the highest badness (F,), worst first, no two within half a second; never NaN.
 
-    Args:
-        frames: frame numbers, shape (F,).
-        taken: indices of frames that were already chosen; returned frames are as far from these as from each other.
+    `frames` (F,) are their numbers; they are as far from the indices in `taken` as from each other.
     """
     apart = max(round(_APART_S * fps), 1)
     found: list[int] = []

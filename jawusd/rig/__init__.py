@@ -1,7 +1,6 @@
 """The rig as OpenUSD: authoring, reading, animation, validation, ONNX sidecars.
 
-May import base, geometry, formats, cameras, evaluator, meshes and media, but no other stage. Modules are loaded when
-one of their names is first used; only `bake` and the `onnx_*` modules need the package onnx (`jawusd[build]`).
+Modules are loaded when one of their names is first used; only `bake` and the `onnx_*` modules need the package onnx.
 """
 
 from __future__ import annotations

@@ -130,10 +130,9 @@ def root_prim_of(actor: Path) -> str:
 
 
 def bake_times(rig: JawRig, frames: Array, d: Array, span: Array) -> tuple[Array, Array]:
-    """Return the times (n,) of the baked samples and the poses T_skull_mandible (n, 4, 4) at these times.
+    """Return times (n,) of baked samples, and the poses T_skull_mandible (n, 4, 4) at these times.
 
-    The times are every whole frame of the span, every sample of d (F, 3) [mm], and as many times in between as are
-    needed to keep all landmarks within 0.02 mm of the model.
+    They are every whole frame of the span, every sample of d (F, 3) [mm], and more to stay within 0.02 mm of the model.
     """
     whole = np.arange(np.ceil(span[0]), np.floor(span[1]) + 1)
     times = np.union1d(np.union1d(whole, span), frames)
@@ -157,12 +156,9 @@ def bake_times(rig: JawRig, frames: Array, d: Array, span: Array) -> tuple[Array
 def author_motion(
     layer: Sdf.Layer, rig: JawRig, frames: Array, d: Array, span: Array, paths: tuple[str, str] = (ACTOR, MANDIBLE)
 ) -> None:
-    """Write samples of d and the baked ops of a mandible into a layer; `paths` are those of the actor and its mandible.
+    """Write samples d (F, 3) [mm] at increasing times (F,), and the baked ops of a mandible over a span, into a layer.
 
-    Args:
-        frames: Times of the samples of d, increasing, shape (F,).
-        d: Values of d at these times [mm], shape (F, 3).
-        span: First and last time to cover.
+    `paths` are those of the actor's and the mandible's prims.
     """
     actor = Sdf.CreatePrimInLayer(layer, paths[0])
     for i, parameter in enumerate(PARAMETERS):

@@ -38,9 +38,7 @@ _DECODER_ARRAYS = ("jaw:model:", "jaw:bounds:", "jaw:contact:", "jaw:joints:", "
 def proxy_layer(
     proxies: Mapping[str, Mesh], meshes: Mapping[str, Mesh], T_rest: Array, estimate: Estimate | None
 ) -> Sdf.Layer:
-    """Build `proxy.usdc`: the content of `geo.usdc` with proxies in place of some meshes, and a class that adds them.
-
-    The other arguments are those of `build_geometry`.
+    """Build `proxy.usdc`, as `build_geometry` with proxies in place of some meshes, and a class that adds them.
 
     Raises:
         RigError: A mesh without faces or with values that are not finite.
@@ -85,11 +83,7 @@ def _rename(mesh: Sdf.PrimSpec, name: str) -> None:
 
 
 def add_detail_variants(actor: Sdf.PrimSpec, proxies: Iterable[str]) -> None:
-    """Add the variants `scan` (selected, empty), `proxy` and `both` to an actor.
-
-    Args:
-        proxies: Names of the meshes that have a proxy.
-    """
+    """Add the variants `scan` (selected, empty), `proxy` and `both` to an actor; `proxies` names meshes with one."""
     variants = layers.add_variants(actor, layout.DETAIL, layout.SCAN, layout.PROXY, layout.BOTH).variants
     file = f"./{layout.PROXY_FILE}"
     for name, payload in ((layout.PROXY, Sdf.Payload(file)), (layout.BOTH, Sdf.Payload(file, _PROXY_CLASS))):

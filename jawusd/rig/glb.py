@@ -76,10 +76,9 @@ def write_glb(
 
 
 def frame_at_zero(frames: Array) -> float:
-    """Return the frame that is at 0 s in the .glb of a take with frames (F,): frame 0, or the first frame.
+    """Return the frame at 0 s in the .glb of a take with frames (F,): frame 0, or the first one.
 
-    It is the first frame if that is negative, because glTF has no times before 0, or if frame numbers are too high for
-    the single precision of glTF's times.
+    glTF has no times before 0, and its single precision resolves no high frame numbers.
     """
     return 0.0 if frames[0] >= 0 and frames[-1] <= _HIGHEST_FRAME else float(frames[0])
 

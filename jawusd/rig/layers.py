@@ -99,9 +99,7 @@ def new_layer(fps: float | None = None, default_prim: str = ACTOR) -> Sdf.Layer:
 def rename_actor(layer: Sdf.Layer, name: str, before: str = Sdf.Path(ACTOR).name, files: str = ".*") -> Sdf.Layer:
     """Rename the actor's prims and joints in an anonymous layer, in place, update all paths to them, and return it.
 
-    Args:
-        before: The current name of the actor's prim; joint names may not have this prefix yet.
-        files: Pattern of asset paths; prim paths in references and payloads to matching files are renamed too.
+    `before` is the current name. Prim paths in references and payloads to files that match a pattern are renamed too.
     """
     renamed_prims = {Sdf.Path(f"/{before}{end}"): Sdf.Path(f"/{name}{end}") for end in ("", PROXY_SUFFIX)}
 

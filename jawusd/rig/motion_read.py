@@ -28,15 +28,11 @@ _RIGID = 1e-5  # maximum rigidity defect; single-precision quaternions written b
 
 @raises_format_error(0)
 def read_poses_of_stage(path: str | os.PathLike[str], prim_path: str | None = None) -> tuple[NDArray[np.int64], Array]:
-    """Read frame numbers (F,) and T_skull_mandible (F, 4, 4) [mm] relative to the actor for all frames of a stage.
-
-    Args:
-        path: An animation layer of a rig, or a shot that references one.
-        prim_path: The rig's prim, if the stage has several rigs.
+    """Read frame numbers (F,) and T_skull_mandible (F, 4, 4) [mm], relative to the actor, at whole frames of a stage.
 
     Raises:
         RigError: The file is not a stage.
-        FormatError: No rig or several rigs, no mandible, no time range, or a motion that is not rigid.
+        FormatError: No rig, several rigs and no `prim_path`, no mandible, no time range, or a motion that is not rigid.
     """
     stage = open_stage(path)
     actor = find_rig_prim(stage, path, prim_path)
@@ -227,9 +223,8 @@ def frames_of_stage(stage: Usd.Stage, path: object) -> NDArray[np.int64]:
 def comparison_times(actor: Usd.Prim, moving: list[Usd.Attribute], by_bones: bool) -> tuple[Array, Array]:
     """Return increasing times (n,) at which a mandible is compared with d, and the allowed landmark distances [mm].
 
-    The times are the keys of d and of the mandible (if only d is keyed, the jaw does not move), and the whole frames
-    between these keys (d and the mandible are interpolated differently). Bones have a key at every key of d, so the
-    keys suffice. n is 0 if nothing has keys; there is then one distance.
+    They are the keys of d and of the mandible (if only d is keyed, the jaw does not move) and, except for bones, the
+    whole frames between, where both are interpolated differently. n is 0 without keys; there is then one distance.
     """
     times, keyed = key_and_frame_times([*moving, *(actor.GetAttribute(name) for name in PARAMETERS)])
     if by_bones:

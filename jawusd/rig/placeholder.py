@@ -81,7 +81,7 @@ def _placed(bone: Mesh, T_anatomical_frame: Array) -> Mesh:
 
 
 def find_condyles(rig: JawRig) -> tuple[Array, str]:
-    """Return the centres of left and right condyle, mandible frame [mm], shape (2, 3), and their source.
+    """Return the centres of left and right condyle, mandible frame [mm], (2, 3), and their source.
 
     The motion determines their height and depth, the landmark their distance from the midline.
     """

@@ -1,7 +1,6 @@
-"""Packages for viewers (`.usdz`), and copies of a rig with unique file names.
+"""Packages for viewers (`.usdz`), flattened into one layer, and copies of a rig with unique file names.
 
-A package is an actor or a whole shot, flattened into one layer. Some tools collect the files of several actors in one
-folder and confuse files of equal names; unique names prevent this.
+Some tools collect the files of several actors in one folder and confuse files of equal names.
 """
 
 from __future__ import annotations

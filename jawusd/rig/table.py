@@ -216,7 +216,7 @@ def _balanced_twists(rig: JawRig, axes: tuple[Array, Array, Array]) -> Array:
 def table_error(rig: JawRig, table: DecoderTable, vertices: Array, d: Array) -> float:
     """Return the largest distance [mm] between table and model at any vertex (V, 3), over parameters d (n, 3).
 
-    The worst parameters are found with the extreme vertices, since the distance is convex, and checked at every vertex.
+    It is convex in the vertex, so the worst parameters are found with the extreme vertices.
     """
     exact = rig.pose(d)
     read = table.pose(d, rig.T_rest)
@@ -231,10 +231,7 @@ def landmark_distance(rig: JawRig, T_a: Array, T_b: Array) -> Array:
 
 
 def largest_distance(T_a: Array, T_b: Array, points: Array) -> Array:
-    """Return the largest distance [mm], shape (n,), between points (V, 3) under two sets of poses (n, 4, 4).
-
-    Its square is a quadratic form in (p, 1), so that one matrix product evaluates all.
-    """
+    """Return the largest distance [mm], (n,), of points (V, 3) under two sets of poses (n, 4, 4): a quadratic form."""
     D = (T_a - T_b)[:, :3, :]
     Q = np.swapaxes(D, 1, 2) @ D
     rows, columns = np.triu_indices(4)

@@ -57,10 +57,7 @@ _RIG_ATTRIBUTES = ("jaw:formatVersion", "jaw:model", "jaw:bounds", "jaw:decoder"
 
 
 def raises_format_error(argument: int) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """Return a decorator that turns errors from values of unexpected types into FormatError.
-
-    `argument` is the index of the positional argument that names the file.
-    """
+    """Return a decorator that turns errors from values of unexpected types in the file `argument` into FormatError."""
 
     def decorate(function: Callable[P, R]) -> Callable[P, R]:
         @functools.wraps(function)

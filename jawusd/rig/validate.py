@@ -1,7 +1,4 @@
-"""Validation of USD files: the rules of jawusd as UsdValidation validators, and the findings of all validators.
-
-The findings of NVIDIA's validator (usd-validation-nvidia) are available if it is installed.
-"""
+"""Validation of USD files: jawusd's rules as UsdValidation validators, and the findings of all, NVIDIA's included."""
 
 from __future__ import annotations
 
