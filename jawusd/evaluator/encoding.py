@@ -22,7 +22,7 @@ from jawusd.evaluator.bounds import SliceHull
 from jawusd.evaluator.models import JawModelForm
 from jawusd.evaluator.motions import RigFrames
 from jawusd.evaluator.solver import Residual, minimise
-from jawusd.geometry.se3 import make_transform, se3_inverse, se3_left_jacobian_inverse, se3_log
+from jawusd.geometry.se3 import make_transform, se3_inverse, se3_left_jacobian_inverse, se3_log, transform_points
 from jawusd.geometry.so3 import hat
 
 # x (k, 3) -> rotations (k, 3, 3), translations (k, 3), spatial derivatives (k, 6, 3)
@@ -147,10 +147,12 @@ class WeightedEncoding(NamedTuple):
 
 
 class Encoder:
-    """Encoder of poses for one model, given the `landmark_vectors` of its rig."""
+    """Encoder of poses for one model and the landmarks (n, 3) [mm] of its rig, mandible frame."""
 
-    def __init__(self, model: JawModelForm, frames: RigFrames, vectors: Array) -> None:
-        self._model, self._frames, self._vectors = model, frames, vectors
+    def __init__(self, model: JawModelForm, frames: RigFrames, landmarks: Array) -> None:
+        self.model, self.frames = model, frames
+        # the four homogeneous vectors (4, 4) that represent the landmarks, anatomical frame [mm]
+        self.vectors = landmark_vectors(transform_points(frames.T_anatomical_mandible_rest, landmarks))
 
     def encode(self, T: Array) -> tuple[Array, Array]:
         """Return the d (n, 3) nearest to poses T_skull_mandible (n, 4, 4), and the residuals (n,) [mm]."""
@@ -159,17 +161,17 @@ class Encoder:
 
     def targets(self, T: Array) -> Array:
         """Apply poses T_skull_mandible (n, 4, 4) to the four vectors; return shape (n, 3, 4), anatomical frame."""
-        return vector_images(*self._frames.motions(T), self._vectors)
+        return vector_images(*self.frames.motions(T), self.vectors)
 
     def residual_mm(self, d: Array, T: Array) -> Array:
         """Return the landmark distances (n,) [mm] between the poses of d (n, 3) and T (n, 4, 4)."""
-        difference = vector_images(*self._model.decode(d), self._vectors) - self.targets(T)
+        difference = vector_images(*self.model.decode(d), self.vectors) - self.targets(T)
         return np.sqrt(np.einsum("nij,nij->n", difference, difference))
 
     def nearest(self, T: Array) -> Array:
         """Return the d (n, 3) nearest to poses T_skull_mandible (n, 4, 4)."""
-        R, t = self._frames.motions(T)
-        return self._model.chart_parameters(nearest_in_chart(self._model, R, t, self._vectors))
+        R, t = self.frames.motions(T)
+        return self.model.chart_parameters(nearest_in_chart(self.model, R, t, self.vectors))
 
     def most_likely(self, T: Array, whitening: Array, start: Array, bound: SliceHull | None) -> Array:
         """Return the most likely d (n, 3) of noisy poses T (n, 4, 4): minimise ``|W xi|^2``, ``T = exp(xi) pose(d)``.
@@ -179,8 +181,8 @@ class Encoder:
             start: Initial d [mm], shape (n, 3), inside the bound if given. NaN gives NaN.
             bound: The bound that d must stay inside.
         """
-        measured = make_transform(*self._frames.motions(T))
-        whitening = whitening @ self._frames.adjoint
+        measured = make_transform(*self.frames.motions(T))
+        whitening = whitening @ self.frames.adjoint
 
         def residual(d: Array, rows: Indices) -> tuple[Array, Array]:
             return self._whitened(d, measured[rows], whitening[rows])
@@ -196,8 +198,8 @@ class Encoder:
         """
         known = np.isfinite(d).all(axis=1)
         found = np.full((len(d), 3, 3), np.nan)
-        measured = make_transform(*self._frames.motions(T[known]))
-        _, J = self._whitened(d[known], measured, whitening[known] @ self._frames.adjoint)
+        measured = make_transform(*self.frames.motions(T[known]))
+        _, J = self._whitened(d[known], measured, whitening[known] @ self.frames.adjoint)
         precision = np.swapaxes(J, 1, 2) @ J
         # keeps the variance finite for a parameter that does not move the jaw
         floor = _MIN_PRECISION * np.einsum("nii->n", precision)[:, None, None] * np.eye(3)
@@ -208,7 +210,7 @@ class Encoder:
 
     def _whitened(self, d: Array, measured: Array, W: Array) -> tuple[Array, Array]:
         """Return ``W xi`` (n, 6), ``measured = exp(xi) motion(d)``, and its derivative with respect to d, (n, 6, 3)."""
-        R_d, t_d, S = self._model.decode_derivative(d)
+        R_d, t_d, S = self.model.decode_derivative(d)
         xi = se3_log(measured @ se3_inverse(make_transform(R_d, t_d)))
         # exp(xi(d + e)) = exp(xi) exp(-S e); the right Jacobian is the left Jacobian at -xi
         return np.einsum("nij,nj->ni", W, xi), -W @ se3_left_jacobian_inverse(-xi) @ S

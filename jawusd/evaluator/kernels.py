@@ -5,46 +5,27 @@ Rows are float64 arrays; rows with a value that is not finite, or above 1e9, giv
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from jawusd.base.arrays import Array, Indices, Mask
 from jawusd.evaluator.batching import in_chunks, pairs_in_chunks, usable_rows
 from jawusd.evaluator.bounds import SliceHull
-from jawusd.evaluator.encoding import Encoder, Handles, distance_residual, landmark_vectors
-from jawusd.evaluator.models import JawModelForm
-from jawusd.evaluator.motions import RigFrames
+from jawusd.evaluator.encoding import Encoder, Handles, distance_residual
 from jawusd.evaluator.nearest import Pull, Vector, lowest_in_valley, nearest_in_valley
 from jawusd.evaluator.operations import triple
 from jawusd.evaluator.solver import Residual, minimise
 from jawusd.evaluator.verdicts import RIGID_TOLERANCE, Limits, Verdicts, judge
-from jawusd.geometry.se3 import rigidity_defect, transform_points
+from jawusd.geometry.se3 import rigidity_defect
 
 _FEW_ROWS = 3  # maximum number of rows that are searched one by one in floats, which is faster for few rows
-
-
-@dataclass(frozen=True)
-class RigParts:
-    """The parts of a rig from which kernels are built."""
-
-    model: JawModelForm  # the jaw model
-    bound: SliceHull  # the bound
-    frames: RigFrames  # the coordinate frames of the rig
-    landmarks: Array  # landmarks of the mandible [mm], mandible frame, shape (n, 3)
-
-    def vectors(self) -> Array:
-        """Return the homogeneous vectors (4, 4) that represent the landmarks, anatomical frame [mm]."""
-        return landmark_vectors(transform_points(self.frames.T_anatomical_mandible_rest, self.landmarks))
 
 
 class NumpyKernels:
     """The kernels of a rig in numpy; subclasses replace some of them with compiled code or graphs."""
 
-    def __init__(self, parts: RigParts) -> None:
-        self._model, self._bound, self._frames = parts.model, parts.bound, parts.frames
-        self._single = parts.model.single
-        self._encoder = Encoder(parts.model, parts.frames, parts.vectors())
+    def __init__(self, encoder: Encoder, bound: SliceHull) -> None:
+        self._encoder, self._bound = encoder, bound
+        self._model, self._frames, self._single = encoder.model, encoder.frames, encoder.model.single
 
     def pose(self, d1: float, d2: float, d3: float) -> Array:
         """Return T_skull_mandible (4, 4) of one d [mm], finite and below 1e4."""

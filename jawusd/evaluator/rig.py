@@ -28,7 +28,7 @@ from jawusd.evaluator.encoding import (
     whitening_of,
 )
 from jawusd.evaluator.judging import SINGLE_LIMIT_MM, RigJudging
-from jawusd.evaluator.kernels import NumpyKernels, RigParts
+from jawusd.evaluator.kernels import NumpyKernels
 from jawusd.evaluator.models import FORMS
 from jawusd.evaluator.motions import RigFrames
 from jawusd.evaluator.search import BoundedSearch, IkResult
@@ -61,7 +61,7 @@ class JawRig(RigJudging, RigAuthoring):
         arrays: Mapping[str, ArrayLike],
         meta: Mapping[str, object],
         *,
-        kernels: Callable[[RigParts], NumpyKernels] = NumpyKernels,
+        kernels: Callable[[Encoder, SliceHull], NumpyKernels] = NumpyKernels,
     ) -> None:
         """Build the rig from the named arrays of a model of format jawusd-model/2 and its header; others are ignored.
 
@@ -80,11 +80,9 @@ class JawRig(RigJudging, RigAuthoring):
         self.speeds = Speeds.from_arrays(self.arrays)
         self.limits = Limits(float(self.arrays["residual_limit_mm"]), self.tolerance_mm)
         self._frames = RigFrames(self.T_anatomical_skull, self.T_rest, self.model.single.anchor)
-        parts = RigParts(self.model, self.bound, self._frames, self.landmarks)
-        self._make_kernels, self.kernels = kernels, kernels(parts)
+        self._encoder = Encoder(self.model, self._frames, self.landmarks)
+        self._make_kernels, self.kernels = kernels, kernels(self._encoder, self.bound)
         self._search = BoundedSearch(self.model, self.bound, self.kernels)
-        self._vectors = parts.vectors()
-        self._encoder = Encoder(self.model, self._frames, self._vectors)
 
     def __reduce__(self) -> tuple[object, ...]:
         arrays = {name: np.array(value) for name, value in self.arrays.items()}
@@ -186,8 +184,8 @@ class JawRig(RigJudging, RigAuthoring):
         if not batch and not inside:
             return Encoding(d[0], residual_mm[0])
         if inside and (out := np.flatnonzero(self.kernels.margins(d) < 0)).size:
-            targets = self._encoder.targets(rows[out])
-            d[out] = in_chunks(lambda target: self._search.solve_ik_multistart(Handles(self._vectors), target), targets)
+            held, targets = Handles(self._encoder.vectors), self._encoder.targets(rows[out])
+            d[out] = in_chunks(lambda target: self._search.solve_ik_multistart(held, target), targets)
             residual_mm[out] = in_chunks(lambda i: self._encoder.residual_mm(d[i], rows[i]), out)
         return Encoding(d.reshape(*batch, 3), residual_mm.reshape(batch))
 

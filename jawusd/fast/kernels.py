@@ -16,7 +16,9 @@ from numpy.typing import ArrayLike
 
 from jawusd.base.arrays import Array
 from jawusd.evaluator.batching import LARGEST
-from jawusd.evaluator.kernels import NumpyKernels, RigParts
+from jawusd.evaluator.bounds import SliceHull
+from jawusd.evaluator.encoding import Encoder
+from jawusd.evaluator.kernels import NumpyKernels
 from jawusd.evaluator.kinds import KINDS
 from jawusd.evaluator.models import AnchoredModel, JawModelForm
 from jawusd.evaluator.motions import RigFrames
@@ -215,10 +217,10 @@ def judge_rows(
 class CompiledKernels(NumpyKernels):
     """Compiled kernels of a rig, accurate to 1e-10; searches along the bound are inherited from `NumpyKernels`."""
 
-    def __init__(self, parts: RigParts) -> None:
-        super().__init__(parts)
-        self._packed_model = packed_model(parts.model, parts.frames, parts.vectors())
-        self._packed_bound = packed_bound(parts.bound)
+    def __init__(self, encoder: Encoder, bound: SliceHull) -> None:
+        super().__init__(encoder, bound)
+        self._packed_model = packed_model(encoder.model, encoder.frames, encoder.vectors)
+        self._packed_bound = packed_bound(bound)
 
     def pose(self, d1: float, d2: float, d3: float) -> Array:
         """Return T_skull_mandible (4, 4) of one d [mm]."""

@@ -18,7 +18,9 @@ except ModuleNotFoundError as error:
 from jawusd.base.arrays import Array
 from jawusd.evaluator import JawRig
 from jawusd.evaluator.batching import usable_rows
-from jawusd.evaluator.kernels import NumpyKernels, RigParts
+from jawusd.evaluator.bounds import SliceHull
+from jawusd.evaluator.encoding import Encoder
+from jawusd.evaluator.kernels import NumpyKernels
 from jawusd.evaluator.rig import load
 from jawusd.rig.onnx_sidecar import Run, check_made_from, load_sidecar, read_sidecar, rig_in, runner
 from jawusd.rig.read import load_rig
@@ -70,8 +72,8 @@ def _rig_beside(path: Path, prim: str | None) -> JawRig:
 class OnnxKernels(NumpyKernels):
     """Kernels that use ONNX graphs for poses, twists, margins and the nearest pose, and numpy for the rest."""
 
-    def __init__(self, decode: bytes, encode: bytes | None, parts: RigParts) -> None:
-        super().__init__(parts)
+    def __init__(self, decode: bytes, encode: bytes | None, encoder: Encoder, bound: SliceHull) -> None:
+        super().__init__(encoder, bound)
         self._files = decode, encode
 
     def pose(self, d1: float, d2: float, d3: float) -> Array:
