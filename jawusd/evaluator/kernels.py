@@ -89,7 +89,7 @@ class NumpyKernels:
         def residual(x: Array, rows: Indices) -> tuple[Array, Array]:
             return x - wanted[rows], np.broadcast_to(identity, (len(x), 3, 3))
 
-        return self._bottom(residual, start)
+        return _with_cost(residual, minimise(residual, start, self._bound))
 
     def solve_ik(self, handles: Handles, targets: Array, start: Array) -> tuple[Array, Array]:
         """Return d (n, 3) [mm] inside the bound that move handles nearest to targets, and squared distances (n,).
@@ -99,24 +99,22 @@ class NumpyKernels:
             targets: Their target positions, anatomical frame [mm], scaled by the weights of the handles, (n, 3, m).
             start: Initial d [mm] inside the bound, shape (n, 3); the results are the local minima around them.
         """
-        if len(start) == 1:
-            residual = distance_residual(self._model.decode_derivative, handles, targets)
+        residual = distance_residual(self._model.decode_derivative, handles, targets)
+        if len(start) != 1:
+            return _with_cost(residual, minimise(residual, start, self._bound))
 
-            def pull(x: Vector) -> Pull:
-                r, J = residual(np.array([x]), np.zeros(1, dtype=np.intp))
-                force, (first, second, third) = triple((-(r[0] @ J[0])).tolist()), (J[0].T @ J[0]).tolist()
-                stiffness = (first[0], first[1], first[2], second[1], second[2], third[2])
-                return Pull(float(r[0] @ r[0]), force, stiffness, (first[0] + second[1] + third[2]) / 3.0)
+        def pull(x: Vector) -> Pull:
+            r, J = residual(np.array([x]), np.zeros(1, dtype=np.intp))
+            force, (first, second, third) = triple((-(r[0] @ J[0])).tolist()), (J[0].T @ J[0]).tolist()
+            stiffness = (first[0], first[1], first[2], second[1], second[2], third[2])
+            return Pull(float(r[0] @ r[0]), force, stiffness, (first[0] + second[1] + third[2]) / 3.0)
 
-            found = np.array([lowest_in_valley(self._bound.formula, pull, triple(start[0].tolist()))])
-            r, _ = residual(found, np.arange(1))
-            return found, np.einsum("nm,nm->n", r, r)
-        return self._bottom(distance_residual(self._model.decode_derivative, handles, targets), start)
+        return _with_cost(residual, np.array([lowest_in_valley(self._bound.formula, pull, triple(start[0].tolist()))]))
 
-    def _bottom(self, residual: Residual, start: Array) -> tuple[Array, Array]:
-        found = minimise(residual, start, self._bound)
-        r, _ = residual(found, np.arange(len(found)))
-        return found, np.einsum("nm,nm->n", r, r)
+
+def _with_cost(residual: Residual, found: Array) -> tuple[Array, Array]:
+    r, _ = residual(found, np.arange(len(found)))
+    return found, np.einsum("nm,nm->n", r, r)
 
 
 def _rigid(T: Array) -> Mask:

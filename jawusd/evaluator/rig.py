@@ -14,7 +14,7 @@ from jawusd.base.arrays import Array, Indices
 from jawusd.base.errors import EvaluatorError, FormatError
 from jawusd.base.npz import read_npz, upgraded_model
 from jawusd.evaluator.authoring import RigAuthoring
-from jawusd.evaluator.batching import CHUNK_ROWS, as_floats, as_points, as_rows, in_chunks, pairs_in_chunks, rows_of
+from jawusd.evaluator.batching import as_floats, as_points, as_rows, in_chunks, pairs_in_chunks, rows_of
 from jawusd.evaluator.bounds import PolygonBound, SliceHull
 from jawusd.evaluator.contact import ContactField
 from jawusd.evaluator.encoding import (
@@ -185,7 +185,7 @@ class JawRig(RigJudging, RigAuthoring):
             return Encoding(d[0], residual_mm[0])
         if inside and (out := np.flatnonzero(self.kernels.margins(d) < 0)).size:
             held, targets = Handles(self._encoder.vectors), self._encoder.targets(rows[out])
-            d[out] = in_chunks(lambda target: self._search.solve_ik_multistart(held, target), targets)
+            d[out] = in_chunks(lambda target: self._search.solve_ik_multistart(held, target)[0], targets)
             residual_mm[out] = in_chunks(lambda i: self._encoder.residual_mm(d[i], rows[i]), out)
         return Encoding(d.reshape(*batch, 3), residual_mm.reshape(batch))
 
@@ -260,14 +260,12 @@ class JawRig(RigJudging, RigAuthoring):
         targets = targets.reshape(len(targets), vectors.shape[1], 3)
         scaled = np.swapaxes(transform_points(self._frames.T_anatomical_skull, targets), 1, 2) * vectors[3]
         if start is None:
-            d = in_chunks(lambda target: self._search.solve_ik_multistart(held, target), scaled)
+            d = in_chunks(lambda target: self._search.solve_ik_multistart(held, target)[0], scaled)
         else:
             given, _ = as_rows(np.broadcast_to(as_floats(start, "start"), (*batch, 3)), (3,), "start")
             first = in_chunks(self._search.nearest, given)
-            find = partial(self._search.solve_ik, held)
-            chunked = len(scaled) > CHUNK_ROWS
             each = np.arange(len(scaled))
-            d = in_chunks(lambda i: find(scaled[i], first[i]), each) if chunked else find(scaled, first)
+            d = in_chunks(lambda i: self._search.solve_ik(held, scaled[i], first[i]), each)
         left = held.across(vector_images(*self.model.decode(d), vectors) - scaled)
         distance_mm = np.sqrt(np.einsum("nij,nij->n", left, left))
         return IkResult(d.reshape(*batch, 3), distance_mm.reshape(batch))

@@ -68,14 +68,6 @@ class BoundedSearch:
         )
         return valid
 
-    def solve_ik_multistart(self, handles: Handles, target: Array) -> Array:
-        """Return the valid d (n, 3) [mm] that move handles nearest to targets (n, 3, m) scaled by their weights.
-
-        Raises:
-            EvaluatorError: the valid volume is empty.
-        """
-        return self._multistart(handles, target)[0]
-
     def solve_ik(self, handles: Handles, target: Array, start: Array) -> Array:
         """Return the local minima in whose basins the starts (n, 3) [mm] lie, which makes dragging continuous.
 
@@ -85,13 +77,17 @@ class BoundedSearch:
         found, left = self._kernels.solve_ik(handles, target, start)
         far = np.flatnonzero(np.linalg.norm(found - start, axis=1) > _MAX_DRAG_MM)
         if far.size:
-            best, least = self._multistart(handles, target[far])
+            best, least = self.solve_ik_multistart(handles, target[far])
             better = least < left[far]
             found[far[better]] = best[better]
         return found
 
-    def _multistart(self, handles: Handles, target: Array) -> tuple[Array, Array]:
-        """Return the lowest minima (n, 3) [mm], and the remaining squared distances (n,)."""
+    def solve_ik_multistart(self, handles: Handles, target: Array) -> tuple[Array, Array]:
+        """Return the valid d (n, 3) [mm] that move handles nearest to targets (n, 3, m), and squared distances (n,).
+
+        Raises:
+            EvaluatorError: the valid volume is empty.
+        """
         images = handles.features(self._scan.images(handles.vectors), self._scan.points)
         wanted = handles.features(target, np.zeros((len(target), 3)))
         best, least = self._best(
