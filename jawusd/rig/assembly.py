@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import NamedTuple
 
 import numpy as np
 from pxr import Sdf, Usd, UsdGeom
@@ -21,12 +20,7 @@ _MM = 0.001  # one millimetre in metres
 _FIRST = Usd.TimeCode.EarliestTime()
 
 
-class Fault(NamedTuple):
-    """A fault: severity ("error" or "warning"), prim, message."""
-
-    severity: str
-    prim: Usd.Prim
-    message: str
+Fault = tuple[str, Usd.Prim, str]  # severity ("error" or "warning"), prim, message
 
 
 def faults_of_assembly(actor: Usd.Prim) -> Iterator[Fault]:
@@ -39,13 +33,13 @@ def faults_of_assembly(actor: Usd.Prim) -> Iterator[Fault]:
         skull, mandible = skull_of(actor, where), mandible_of(actor, where)
     except FormatError as error:
         if error.message.startswith("jaw:skull"):
-            yield Fault("error", actor, error.message)
+            yield "error", actor, error.message
         return  # the rule for the mandible reports this fault
     if skull is None:
-        yield Fault("warning", actor, "has no active skull (jaw:skull).")
+        yield "warning", actor, "has no active skull (jaw:skull)."
     elif skull.GetPath().HasPrefix(mandible.GetPath()) or mandible.GetPath().HasPrefix(skull.GetPath()):
         paths = f"jaw:skull ({skull.GetPath()}) and jaw:mandible ({mandible.GetPath()})"
-        yield Fault("error", actor, f"{paths} move together: they are the same prim, or one is below the other.")
+        yield "error", actor, f"{paths} move together: they are the same prim, or one is below the other."
     yield from _resets(actor, [prim for prim in (skull, mandible) if prim])
     yield from _hidden(actor, skull, mandible)
     yield from _joints(actor, mandible)
@@ -53,7 +47,7 @@ def faults_of_assembly(actor: Usd.Prim) -> Iterator[Fault]:
 
 def _muted(actor: Usd.Prim) -> Iterator[Fault]:
     for name in actor.GetStage().GetMutedLayers():
-        yield Fault("error", actor, f"the layer {name} is muted.")
+        yield "error", actor, f"the layer {name} is muted."
 
 
 def _units(actor: Usd.Prim) -> Iterator[Fault]:
@@ -67,15 +61,15 @@ def _units(actor: Usd.Prim) -> Iterator[Fault]:
         if root.pseudoRoot.HasInfo(name) and own.pseudoRoot.HasInfo(name) and found != wanted:
             difference = f"the stage has {name} = {found}, but the layer of the rig has {wanted}"
             if sublayered:
-                yield Fault("error", actor, f"{difference}: set both to the same value, or reference the rig instead.")
+                yield "error", actor, f"{difference}: set both to the same value, or reference the rig instead."
             elif name == "upAxis" and np.allclose(axes := _axes(actor, _FIRST), np.diag(np.diag(axes))):
-                yield Fault("warning", actor, f"{difference}, and no transform rotates the actor about x.")
+                yield "warning", actor, f"{difference}, and no transform rotates the actor about x."
     metres = UsdGeom.GetStageMetersPerUnit(stage)
     size = float(np.cbrt(abs(np.linalg.det(_axes(actor, _FIRST))))) * metres / _MM
     known = UsdGeom.StageHasAuthoredMetersPerUnit(stage) and not sublayered
     if known and size and not _SIZES[0] <= size <= _SIZES[1]:
         message = f"is {size:.3g} times life size: the stage has {metres:g} m per unit, but the actor is in mm. "
-        yield Fault("warning", actor, f"{message}Scale the actor by {_MM / metres:g}.")
+        yield "warning", actor, f"{message}Scale the actor by {_MM / metres:g}."
 
 
 def _axes(actor: Usd.Prim, time: Usd.TimeCode) -> Array:
@@ -96,10 +90,10 @@ def _shape(actor: Usd.Prim) -> Iterator[Fault]:
         first = int(np.argmax(uneven))
         listed = ", ".join(f"{scale:.4g}" for scale in scales[first])
         message = f"has a non-uniform scale, its own or that of its parents, at {times[first]}: scales {listed}."
-        yield Fault("error", actor, message)
+        yield "error", actor, message
     elif mirrored.any():
         message = f"is mirrored at {times[int(np.argmax(mirrored))]}: left and right of the jaw are swapped."
-        yield Fault("error", actor, message)
+        yield "error", actor, message
 
 
 def _resets(actor: Usd.Prim, parts: list[Usd.Prim]) -> Iterator[Fault]:
@@ -107,7 +101,7 @@ def _resets(actor: Usd.Prim, parts: list[Usd.Prim]) -> Iterator[Fault]:
     meshes = [mesh for part in parts for mesh in meshes_below(part)]
     for prim in dict.fromkeys(above for mesh in meshes for above in prims_between(mesh, actor)):
         if prim not in parts[-1:] and UsdGeom.Xformable(prim).GetResetXformStack():  # another rule checks the mandible
-            yield Fault("error", prim, "!resetXformStack! detaches it from the actor.")
+            yield "error", prim, "!resetXformStack! detaches it from the actor."
 
 
 def _hidden(actor: Usd.Prim, skull: Usd.Prim | None, mandible: Usd.Prim) -> Iterator[Fault]:
@@ -115,7 +109,7 @@ def _hidden(actor: Usd.Prim, skull: Usd.Prim | None, mandible: Usd.Prim) -> Iter
     meshes = meshes_below(mandible)
     skull_meshes = meshes_below(skull) if skull else []
     if not meshes:
-        yield Fault("error", mandible, "has no active mesh.")
+        yield "error", mandible, "has no active mesh."
         return
     above = dict.fromkeys(prim for mesh in (*meshes, *skull_meshes) for prim in _with_ancestors(mesh))
     imageable = [UsdGeom.Imageable(prim) for prim in above if prim.IsA(UsdGeom.Imageable)]
@@ -123,7 +117,7 @@ def _hidden(actor: Usd.Prim, skull: Usd.Prim | None, mandible: Usd.Prim) -> Iter
     for time in time_codes(times[keyed]):
         others = skull_meshes or [actor]
         if not any(_is_visible(mesh, time) for mesh in meshes) and any(_is_visible(p, time) for p in others):
-            yield Fault("error", mandible, f"is hidden at {time} while the rest of the actor is visible.")
+            yield "error", mandible, f"is hidden at {time} while the rest of the actor is visible."
             return
 
 
@@ -149,9 +143,9 @@ def _joints(actor: Usd.Prim, mandible: Usd.Prim) -> Iterator[Fault]:
             other.GetPrimAtPath(actor.GetPath()).GetVariantSet(MOTION).SetVariantSelection(SKELETON)
         bones = bones_of(other.GetPrimAtPath(mandible.GetPath()))
         if bones is None:
-            yield Fault("error", actor, f"no bones move the mandible in the variant {SKELETON}.")
+            yield "error", actor, f"no bones move the mandible in the variant {SKELETON}."
             return
     foreign = bones.foreign_joints() if bones is not None else []
     if foreign:
         message = f"the joints {', '.join(foreign)} are animated, but the skeleton has no joints of these names."
-        yield Fault("error", mandible, message)
+        yield "error", mandible, message

@@ -233,16 +233,6 @@ def without_warning(words: str) -> Iterator[None]:
             Tf.Warn(commentary)
 
 
-def check_layer_name(path: Path) -> None:
-    """Check the suffix of a layer, since OpenUSD writes text into files of any other name.
-
-    Raises:
-        OutputError: The name does not end in .usda, .usdc or .usd.
-    """
-    if path.suffix.lower() not in (".usda", ".usdc", ".usd"):
-        raise OutputError("the name of a USD layer must end in .usdc, .usda or .usd.", path=path)
-
-
 def write_layer(layer: Sdf.Layer, path: Path) -> Path:
     """Write a layer to a file atomically, and reload the file's layer if it is open in this process.
 
@@ -251,7 +241,8 @@ def write_layer(layer: Sdf.Layer, path: Path) -> Path:
             support its path.
     """
     path = Path(path)
-    check_layer_name(path)
+    if path.suffix.lower() not in (".usda", ".usdc", ".usd"):  # OpenUSD writes text into files of any other name
+        raise OutputError("the name of a USD layer must end in .usdc, .usda or .usd.", path=path)
     check_path(path, OutputError)
     with atomic_path(path) as temporary:
         try:

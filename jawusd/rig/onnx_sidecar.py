@@ -118,13 +118,7 @@ def _model(
         ir_version=_IR_VERSION,
         opset_imports=[helper.make_opsetid("", OPSET)],
     )
-    helper.set_model_props(model, {**_metadata(rig), **more})
-    onnx.checker.check_model(model, full_check=True)
-    return model
-
-
-def _metadata(rig: JawRig) -> dict[str, str]:
-    return {
+    metadata = {
         "format": FORMAT,
         "length_unit": "mm",
         "angle_unit": "rad",
@@ -134,6 +128,9 @@ def _metadata(rig: JawRig) -> dict[str, str]:
         "rig_hash": rig.model_hash,
         "d_range_mm": json.dumps(rig.d_range.tolist()),
     }
+    helper.set_model_props(model, {**metadata, **more})
+    onnx.checker.check_model(model, full_check=True)
+    return model
 
 
 def _whole_rig(rig: JawRig) -> dict[str, str]:

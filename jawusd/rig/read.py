@@ -226,6 +226,7 @@ def describe(path: PathArg, prim_path: str | None = None) -> Description:
     prim = find_rig_prim(stage, path, prim_path)
     rig = rig_of(prim, path)
     table = read_table(prim, path)
+    speeds = rig.speeds
     names = np.array(read_value(prim, "jaw:landmarks:names", path)).tolist()
     samples = key_times(prim.GetAttribute(PARAMETERS[0]))
     animation = {"samples": len(samples), "first": samples[0], "last": samples[-1]} if samples else None
@@ -242,10 +243,7 @@ def describe(path: PathArg, prim_path: str | None = None) -> Description:
         "twist_order": ["omega", "v"],
         "ranges_mm": {name.removeprefix("jaw:"): row.tolist() for name, row in zip(PARAMETERS, rig.d_range)},
         "landmarks_mm": dict(zip(names, rig.landmarks.tolist(), strict=True)),
-        "thresholds_mm": {
-            "residual": rig.limits.residual_mm,
-            "tolerance": rig.tolerance_mm,
-        },
+        "thresholds_mm": {"residual": rig.limits.residual_mm, "tolerance": rig.tolerance_mm},
         "held_out": rig.held_out and rig.held_out._asdict(),
         "table": {
             "format": table.format,
@@ -260,7 +258,9 @@ def describe(path: PathArg, prim_path: str | None = None) -> Description:
         "estimated_condyles": _estimated_condyles(placeholders),
         "contact": rig.meta.get("contact"),
         "joints": rig.meta.get("joints"),
-        "speeds": _speeds(rig),
+        "speeds": None
+        if speeds is None
+        else {"rms_mm_s": speeds.rms_mm_s.tolist(), "rms_mm_s2": speeds.rms_mm_s2.tolist()},
         "errors": rig.meta.get("errors"),
     }
 
@@ -273,13 +273,6 @@ def _estimated_condyles(placeholders: list[Usd.Prim]) -> dict[str, str | float |
         placeholders[0].GetAttribute(f"jaw:placeholder:{name}").Get() for name in ("condyles", "condyleError")
     )
     return {"source": source, "error_mm": error}
-
-
-def _speeds(rig: JawRig) -> dict[str, list[float]] | None:
-    """Return the root mean square speeds [mm/s] and accelerations [mm/s^2] of (d1, d2, d3) in the take."""
-    if rig.speeds is None:
-        return None
-    return {"rms_mm_s": rig.speeds.rms_mm_s.tolist(), "rms_mm_s2": rig.speeds.rms_mm_s2.tolist()}
 
 
 def _meshes(prim: Usd.Prim, where: object) -> dict[str, int]:

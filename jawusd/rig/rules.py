@@ -152,34 +152,21 @@ def check_mandible(prim: Usd.Prim) -> Iterator[Finding]:
         message += "Move the actor instead."
         yield _finding("error", "Mandible", prim, message)
         return
-    unkeyed = not any(attribute.GetNumTimeSamples() for attribute in moving)
-    yield from _check_baked(rig, mandible, times, baked, _parameters(prim, times), allowed_mm, unkeyed)
+    error_mm = landmark_distance(rig, baked, rig.pose(_parameters(prim, times)))
+    over_mm = error_mm - allowed_mm
+    worst = int(np.argmax(np.where(np.isfinite(over_mm), over_mm, np.inf)))
+    if not over_mm[worst] <= 0:
+        message = f"the baked pose at {times[worst]} is {error_mm[worst]:.3f} mm from the pose of d; "
+        message += f"the maximum is {allowed_mm[worst]:.2f} mm."
+        keyed = any(attribute.GetNumTimeSamples() for attribute in moving)
+        message += " To make them agree, run" if keyed else " Only d is keyed, not the mandible: bake it with"
+        yield _finding("error", "Mandible", mandible, f"{message} `jawusd rebake`.")
 
 
 def check_assembly(prim: Usd.Prim) -> Iterator[Finding]:
     """Check that a shot does not hide, deform, detach or rescale the jaw of an actor."""
     for severity, at, message in faults_of_assembly(prim):
         yield _finding(severity, "Assembly", at, message)
-
-
-def _check_baked(
-    rig: JawRig,
-    mandible: Usd.Prim,
-    times: list[Usd.TimeCode],
-    baked: Array,
-    d: Array,
-    allowed_mm: Array,
-    unkeyed: bool,
-) -> Iterator[Finding]:
-    error_mm = landmark_distance(rig, baked, rig.pose(d))
-    over_mm = error_mm - allowed_mm
-    worst = int(np.argmax(np.where(np.isfinite(over_mm), over_mm, np.inf)))
-    if not over_mm[worst] <= 0:
-        message = f"the baked pose at {times[worst]} is {error_mm[worst]:.3f} mm from the pose of d; "
-        message += f"the maximum is {allowed_mm[worst]:.2f} mm."
-        message += " Only d is keyed, not the mandible: bake it with" if unkeyed else " To make them agree, run"
-        message += " `jawusd rebake`."
-        yield _finding("error", "Mandible", mandible, message)
 
 
 def _reporting_errors(name: str, rule: Rule) -> Rule:
