@@ -14,6 +14,7 @@ from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdShade
 from jawusd.base.arrays import Array, Mask
 from jawusd.base.errors import RigError
 from jawusd.formats.mesh import Mesh, crown_face_mask, natural_colors, without_loose
+from jawusd.meshes import surfaces
 from jawusd.rig import layers
 from jawusd.rig.attributes import value_of
 from jawusd.rig.layers import add_pose, define_prim, new_layer, set_attribute, stage_of
@@ -206,15 +207,9 @@ def corner_normals(mesh: Mesh) -> Array:
 
 def vertex_normals(mesh: Mesh) -> Array:
     """Return smooth unit normals, shape (V, 3): face normals weighted by area."""
-    a, b, c = (mesh.vertices[mesh.faces[:, i]] for i in range(3))
-    area = np.cross(b - a, c - a)
-    normals = np.empty_like(mesh.vertices)
-    corners = mesh.faces.reshape(-1)
-    for axis in range(3):
-        normals[:, axis] = np.bincount(corners, np.repeat(area[:, axis], 3), minlength=len(mesh.vertices))
-    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    normals = surfaces.vertex_normals(mesh.vertices, mesh.faces)
     # vertices whose faces are all degenerate get an arbitrary unit vector
-    return np.where(length > 0, normals / np.where(length > 0, length, 1.0), [0.0, 1.0, 0.0])
+    return np.where(np.linalg.norm(normals, axis=1, keepdims=True) > 0.5, normals, [0.0, 1.0, 0.0])
 
 
 @raises_format_error(0)
