@@ -228,8 +228,7 @@ def _distance_to_edges(points: Array, edges: Array) -> Array:
     length_squared = np.maximum(np.einsum("ei,ei->e", along, along), np.finfo(float).tiny)
     s = np.clip((rx * along[:, 0] + ry * along[:, 1]) / length_squared, 0.0, 1.0)
     distance = np.sqrt(np.min((rx - s * along[:, 0]) ** 2 + (ry - s * along[:, 1]) ** 2, axis=1))
-    # a ray from the point to +x crosses an edge if the edge's ends lie on both sides of the ray, and the point lies to
-    # the left of the edge
+    # a ray from the point to +x crosses an edge if its ends lie on both sides of the ray, and the point to its left
     crosses = (edges[:, 0, 1] > y) != (edges[:, 1, 1] > y)
     left = (rx * along[:, 1] < ry * along[:, 0]) == (along[:, 1] > 0)
     inside = np.count_nonzero(crosses & left, axis=1) % 2 == 1

@@ -20,13 +20,12 @@ MAX_STRETCH = 1.045  # maximum factor by which a step may grow: 5 %, less an all
 
 _SAMPLE_MM = 0.2  # sample spacing [mm] near the bound
 _MAX_PIECES = 400  # maximum number of samples in one step
-# Maximum gradient norm of the margin: a step stays inside if the margin at both ends is at least this times the step
-# length.
-_STEEPEST = 5.0
+_STEEPEST = (
+    5.0  # maximum gradient norm of the margin: a step stays inside with at least this times its length as margin
+)
 _STILL_MM = 1e-12
 _TIME_SHARE = 0.998  # fraction of the available time that a path may take; finer sampling lengthens the path slightly
-# Straight lines between samples are checked at points `_CHECK_MM` apart, and more finely where the margin is below
-# `_NEAR_MM`.
+# Lines between samples are checked at points `_CHECK_MM` apart, and more finely where the margin is below `_NEAR_MM`.
 _CHECK_MM, _NEAR_MM, _MAX_ROUNDS, _ROUNDING_MM = 0.03, 1e-3, 8, 1e-9
 
 _LINE_MM = 0.1  # sample spacing [mm] of shortcuts
@@ -39,9 +38,7 @@ _TIGHT_SHARES = (1.0, 0.5, 0.25, 0.1)
 class Inside(NamedTuple):
     """A motion inside the bound."""
 
-    #: sample times, shape (n,): the original ones, and more where straight lines between the original samples would
-    #: leave the bound
-    times: Array
+    times: Array  # sample times, shape (n,): the original ones, and more where lines between them would leave the bound
     d: Array  # jaw parameters at these times [mm], linear in between, shape (n, 3)
     given: Mask  # mask of the original samples, shape (n,)
 

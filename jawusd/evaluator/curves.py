@@ -26,8 +26,7 @@ class HermiteCurve:
     coefficients: Array = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        # coefficients of s = x - knot per interval; intervals 0 and n are the straight ends, so that evaluation needs
-        # no special case
+        # coefficients of s = x - knot per interval; intervals 0 and n are the straight ends, for which all is linear
         y, m = self.values, self.slopes
         inner = np.stack(cubic(np.diff(self.knots)[:, None], y[:-1], y[1:], m[:-1], m[1:]), axis=1)
         straight = np.zeros((2, *inner.shape[1:]))

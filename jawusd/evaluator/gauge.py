@@ -29,9 +29,7 @@ from jawusd.geometry.rodrigues import N, Triple
 
 INVERSE_TOLERANCE_MM = 1e-13
 INVERSE_ITERATIONS = 120
-# Number of iterations after which Newton's method counts as stalled; from then on, steps are doubled or the bracket is
-# halved.
-PATIENCE = 8
+PATIENCE = 8  # iterations after which Newton counts as stalled; then steps are doubled or the bracket is halved
 INVERSE_STEP_MM = 20.0
 MIN_INVERSE_SLOPE = 0.2  # lower limit of the derivative; smaller values would let Newton steps diverge from the root
 MAX_DOUBLINGS = 64
@@ -203,8 +201,7 @@ class Gauge:
     #: coefficients of gx and gz: ``sum_k c_k (d1 / path_scale_mm)^k, k = 1..5`` [mm], shape (2, 5)
     path_coefficients: Array
     path_scale_mm: float  # length that scales the argument of the polynomials to order one
-    #: d1 interval [mm] of the polynomials; outside they continue as straight lines (C1), and ``rho`` uses d1 softly
-    #: clamped to the interval
+    #: d1 interval [mm] of the polynomials, which continue as straight lines; ``rho`` uses d1 softly clamped to it
     path_limits: tuple[float, float]
     glide_arch: Array  # coefficients of rho, shape (7,)
     glide_drop: Array  # coefficients of drop, shape (4,)

@@ -127,8 +127,7 @@ class AnchoredModel(JawModelForm):
     single: SingleAnchored = field(init=False, repr=False)  # the model for one row, in floats
 
     def __post_init__(self) -> None:
-        # sum_i W_i r_i^3 and its gradient need only sums of r_i times W_i, W_i c_i and W_i |c_i|^2 (see _spline):
-        # one matrix product gives both
+        # one matrix product gives the sums of r_i times W_i, W_i c_i and W_i |c_i|^2, from which `_spline` follows
         squared = np.einsum("ij,ij->i", self.centres, self.centres)
         kernel = self.weights[: len(self.centres)]
         by_centre = (kernel[:, :, None] * self.centres[:, None, :]).reshape(len(kernel), 9)

@@ -12,8 +12,7 @@ from jawusd.base.arrays import Array
 from jawusd.base.errors import EvaluatorError
 
 _MIN_FRAMES = 30  # minimum number of fourth differences for an estimate
-# Sums of the squared coefficients of first, second and fourth differences: the factors by which differencing multiplies
-# the variance of white noise.
+# Factors by which first, second and fourth differences multiply the variance of white noise.
 _NOISE_IN = {1: 2.0, 2: 6.0, 4: 70.0}
 _SIGMA_OF_MEDIAN = 1.4826  # ratio of standard deviation to median absolute value of a normal distribution
 _MIN_SIGNAL = 0.05  # Minimum fraction of the observed variance that is attributed to motion.

@@ -12,8 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from jawusd.base.arrays import Array, Mask
 from jawusd.evaluator.formula import ON_BOUND_MM
 
-# Maximum deviation from a rigid transform: accepts matrices rounded to 5 decimals or to half precision, rejects sheared
-# or scaled ones.
+# Maximum deviation from a rigid transform: accepts matrices rounded to 5 decimals, rejects sheared or scaled ones.
 RIGID_TOLERANCE = 1e-3
 
 INSIDE, OUTSIDE = "inside", "outside"
@@ -52,9 +51,7 @@ _WORDS = {
 class Verdicts(NamedTuple):
     """Result of `JawRig.validate`, one entry per pose."""
 
-    #: whether no `Reason` applies to the pose, bool, shape (...). Measured poses are also valid outside the bound
-    #: within the tolerance
-    valid: Mask
+    valid: Mask  # whether no `Reason` applies, shape (...); measured poses may lie outside the bound by the tolerance
     #: `Reason` flags, uint8, shape (...); ``Reason(int(code))`` names them, `words` spells them out
     reason: NDArray[np.uint8]
     residual_mm: Array  # RMS landmark distance to the nearest pose of the model, (...); NaN if not finite or not rigid

@@ -38,9 +38,8 @@ _DAY_S = 86_400
 _FEWEST_REPEATED = 3  # minimum number of distinct time codes from which repetition is detected
 _FEWEST_ROWS, _MOST_ROWS = 0.9, 1.02  # range of the ratio of the median number of rows per second to the requested rate
 _MOST_STEPS_OFF = 2.0  # maximum difference between steps across seconds and within a second [steps]
-# Accepted range of weights, and the weight above which weights are assumed to be percentages. ARKit's weights are 0 to
-# 1. Subtracting a neutral face or applying gains can move weights slightly outside this range; percentages and
-# standardised weights lie far outside.
+# Accepted range of weights, which a neutral face or gains can move slightly outside 0 to 1, and the weight above which
+# weights are assumed to be percentages.
 _LEAST_WEIGHT, _MOST_WEIGHT, _PERCENT = -0.5, 2.0, 10.0
 _MAX_BYTES = 1 << 30
 
@@ -60,8 +59,7 @@ class FaceCapture:
     """The jaw weights of a face capture."""
 
     frames: Array  # increasing frame numbers, 0 in the first row, possibly fractional, shape (F,)
-    # JawOpen, JawLeft (subject's left), JawRight, JawForward: nominally 0 to 1, NaN if no face was detected, shape (F,
-    # 4).
+    # JawOpen, JawLeft (subject's left), JawRight, JawForward: nominally 0 to 1, NaN if no face was seen, shape (F, 4)
     weights: Array
     fps: float  # frame rate [Hz]
     timecode: str  # time code of the first row, as written

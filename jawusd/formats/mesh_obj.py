@@ -29,8 +29,7 @@ _MARKS = {b"\xff\xfe": "utf-16", b"\xfe\xff": "utf-16"}
 _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?|[-+]?(?:nan|inf(?:inity)?)", re.IGNORECASE)
 # Comment with the face count that MeshLab writes above the faces.
 _COUNTED = re.compile(r"^#\s*Faces:\s*(\d+)\s*$", re.MULTILINE | re.IGNORECASE)
-# Minimum fraction of unused vertices for a file without a final line break to count as truncated; OBJ files do not
-# declare the number of faces.
+# Minimum fraction of unused vertices for a file without a final line break to count as truncated: no count is declared.
 _LEAST_LOOSE = 0.1
 
 

@@ -31,8 +31,7 @@ def read_stl(path: Path) -> MeshData:
     """
     data = read_mesh_bytes(path)
     begins_as_text = data[:512].removeprefix(b"\xef\xbb\xbf").lstrip()[:5].lower() == b"solid"
-    # A binary header may also start with "solid", but any plausible triangle count contains a zero byte, which text
-    # does not.
+    # A binary header may also start with "solid", but its triangle count contains a zero byte, which text does not.
     corners = _text(path, data) if begins_as_text and 0 not in data[80:_HEADER] else _binary(path, data)
     return MeshData(corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3))
 

@@ -56,8 +56,7 @@ class Performance:
     #: covariance of head twist (in head axes about `pivot`; omega [rad], v [mm]) and of d [mm], shape (F, 9, 9)
     covariance: Array
     rig_covariance: Array  # covariance of d due to rig error [mm^2], shape (F, 3, 3)
-    #: covariance of the mandible's pose due to rig error, as a twist (omega [rad], v [mm]) in the skull frame, shape
-    #: (F, 6, 6)
+    #: covariance of the mandible's pose due to rig error, a twist (omega [rad], v [mm]), skull frame, shape (F, 6, 6)
     rig_pose_covariance: Array
     pivot: Array  # reference point of the head twist, upper scan frame [mm], shape (3,)
     state: NDArray[np.int8]  # `SolveState`, shape (F,)

@@ -91,13 +91,11 @@ class Tracks:
     #: whether a frame was recovered with a kinematic prior, (F,). If the metadata has `prior_spread_mm`, all final
     #: poses used a prior, as in tracking by colour
     prior_aided: Mask
-    #: fraction of mask pixels not covered by the projected scan (E_SP of paper eq. 8 over segmented pixels), shape (F,
-    #: 2, C); NaN without a mask
+    #: fraction of mask pixels not covered by the projected scan (paper eq. 8), shape (F, 2, C); NaN without a mask
     coverage_error: Array
     #: which masks were used for the raw poses, shape (F, 2, C); all other masks are missing or outliers
     masks_used: Mask
-    #: covariance of the left twist xi [rad, mm] with T_true = exp(xi) T, world frame, about the world origin, shape (F,
-    #: 6, 6)
+    #: covariance of xi [rad, mm] with T_true = exp(xi) T, world frame, about the world origin, shape (F, 6, 6)
     covariance_upper: Array
     covariance_lower: Array  # likewise
     covariance_relative: Array  # covariance of T_upper_lower, likewise in the skull frame, shape (F, 6, 6)
@@ -107,8 +105,7 @@ class Tracks:
     camera_names: tuple[str, ...]  # names of the cameras, length C
     meta: TracksMeta = field(default_factory=TracksMeta)
     solved: SolvedJaw | None = None  # jaw parameters and state of each frame of a solved performance; otherwise None
-    #: `LostReason` of the first pass, shape (F, 2); kept if a prior later recovered the pose. Optional in files, like
-    #: `lost_value` and `lost_limit`
+    #: `LostReason` of the first pass, shape (F, 2), kept if a prior recovered the pose; optional in files
     lost_reason: NDArray[np.uint8] = field(default_factory=lambda: np.zeros((0, 2), np.uint8))
     #: measured value in the unit of the reason, shape (F, 2); NaN without a reason
     lost_value: Array = field(default_factory=lambda: np.zeros((0, 2)))

@@ -26,8 +26,7 @@ from jawusd.rig.untrusted import raises_format_error
 
 TAKE, TAKE_CAMERAS = "/Take", "/Take/Cameras"
 
-# File patterns of undistorted images, relative to the take, numbered by time code: JPEG, and EXR for footage in linear
-# light.
+# File patterns of undistorted images, relative to the take, numbered by time code; EXR for footage in linear light.
 PLATE = "plates/{name}/{name}.%06d.jpg"
 LIGHT_PLATE = "plates/{name}/{name}.%06d.exr"
 

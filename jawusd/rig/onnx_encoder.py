@@ -66,13 +66,11 @@ def images(g: Graph, rig: JawRig, motion: RigidMotion[Value], vectors: Array) ->
 
 
 _GAUSS_NEWTON, _NEWTON = 12, 60  # maximum numbers of iterations
-# Step length below which a row has converged. The loop ends when all rows have converged; their last steps are taken
-# without another evaluation of the model.
+# Step length below which a row has converged; its last step is taken without another evaluation of the model.
 _CONVERGED_MM = 1e-6
 _START_DAMPING = 1e-6
 _MIN_DAMPING = 1e-12
-# Numbers of columns that an iteration passes to the next one; `normal` holds the products of the three derivatives and
-# the residual, a matrix (4, 4).
+# Numbers of columns passed between iterations; `normal` (4, 4) holds the products of three derivatives and residual.
 _LOOP_STATE = {"x": 3, "normal": 16, "trial": 3, "damping": 1}
 _MATRIX, _SLOPE, _COST = [0, 1, 2, 4, 5, 6, 8, 9, 10], [3, 7, 11], [15]
 

@@ -19,8 +19,7 @@ from jawusd.geometry.rodrigues import Triple, angle_quotients
 # absolute Bernoulli numbers |B_2k|, k = 1..8, in the series of the inverse left Jacobian
 _BERNOULLI = (1 / 6, 1 / 30, 1 / 42, 1 / 30, 5 / 66, 691 / 2730, 7 / 6, 3617 / 510)
 _INVERSE_SERIES = [number / factorial(2 * k) for k, number in enumerate(_BERNOULLI, start=1)]
-# Squared angle below which the series is used, as the closed forms suffer from cancellation in float32; above it, the
-# series is inaccurate.
+# Squared angle below which the closed forms suffer from cancellation in float32; above, the series is inaccurate.
 _SERIES_BELOW_RAD2 = 0.25
 
 _ARITHMETIC = {"Add": "Add", "Subtract": "Sub", "Multiply": "Mul", "Divide": "Div"}

@@ -25,9 +25,7 @@ from jawusd.evaluator.rig import load
 from jawusd.rig.onnx_sidecar import Run, check_made_from, load_sidecar, read_sidecar, rig_in, runner
 from jawusd.rig.read import load_rig
 
-# Absolute margin [mm] below which margins are recomputed in double precision, because their sign is uncertain in single
-# precision.
-_NEAR_MM = 1e-3
+_NEAR_MM = 1e-3  # absolute margin below which the sign is uncertain in single precision, and is computed in double
 
 
 def load_onnx(path: str | os.PathLike[str], prim: str | None = None) -> JawRig:

@@ -20,18 +20,14 @@ from jawusd.rig import layers, layout
 from jawusd.rig.asset_paths import CHECKSUMS, record_checksums
 from jawusd.rig.read import describe, open_stage
 
-# File time in packages [s since 1970]; a fixed time makes packages reproducible. It is the earliest time that a zip can
-# store in any time zone.
-_ZIP_EPOCH = 315_619_200
+_ZIP_EPOCH = 315_619_200  # fixed file time in packages [s since 1970], the earliest in a zip of any time zone
 _OP = "xformOp:"
 _PREFIX = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,63}")
 _LAYERS, _COPIED = (".usda", ".usdc", ".usd"), (".onnx",)
 # Files of a rig, each before the files that refer to it.
 _FIRST = (layout.GEO_FILE, layout.PROXY_FILE, layout.RIG_FILE, layout.ONNX_FILE, layout.ENCODE_FILE, layout.ACTOR_FILE)
 _NAMES_INSIDE = "actor.usdc", "shot.usdc"
-# Offset that makes integers non-integer: binary layers compress vectors of small integers, which three.js (r187)
-# decodes as NaN.
-_OFFSET = 1e-9
+_OFFSET = 1e-9  # makes integers non-integer: three.js (r187) decodes compressed vectors of integers as NaN
 
 
 def write_package(out: str | os.PathLike[str], source: str | os.PathLike[str]) -> Path:

@@ -112,8 +112,7 @@ def rig_of(prim: Usd.Prim, where: object) -> JawRig:
         rig = JawRig(arrays, meta)
     except EvaluatorError as error:
         raise FormatError(error.message, path=str(where)) from error
-    # In a folder, a mismatch may come from edited thresholds. In a package, it means that files of equal names were
-    # mixed.
+    # In a folder, a mismatch may come from edited thresholds; in a package, files of equal names were mixed.
     packed = prim.GetStage().GetRootLayer().identifier.endswith(".usdz")
     if packed and not set(recorded_hashes(prim)) <= {None, rig.model_hash}:
         raise FormatError(

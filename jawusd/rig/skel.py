@@ -27,9 +27,7 @@ _TYPES = Sdf.ValueTypeNames
 JOINTS = ("skull", "skull/jaw")
 SKEL, KEYS = f"{layout.ACTOR}/Skel", f"{layout.ACTOR}/Skel/Motion"
 _SKEL_IN_GEO = f"{layout.GEO}/Skel"
-# Maximum difference between the matrix entries of meshes that move together [mm or 1]; far above single-precision
-# rounding at 100 mm from the origin.
-SAME_MOTION = 1e-4
+SAME_MOTION = 1e-4  # maximum difference of matrix entries of meshes that move together, far above rounding [mm or 1]
 _BIND_RIGIDLY = "Bind every mesh of the mandible to one joint, or name meshes to be fitted with --mandible and --skull."
 
 
