@@ -128,9 +128,10 @@ def _timed(table: TextTable, at: int, fps: float | None) -> tuple[Array, float, 
     number = _numbers_per_second(seconds, inside, fps, table, at)
     dropped = _dropped(seconds, inside, number, any(";" in code for code in written))
     rate = float(number) if fps is None else fps
-    if dropped or _is_of_ntsc(rate):
-        rate = math.ceil(rate - _NTSC_SLACK) * 1000 / 1001
-    frames = _frames(seconds, inside, number, dropped, table, at) * (math.ceil(rate - _NTSC_SLACK) / number)
+    whole = math.ceil(rate - _NTSC_SLACK)
+    if dropped or abs(rate - whole * 1000 / 1001) < _NTSC_SLACK:  # an NTSC rate, such as 29.97 = 30000 / 1001
+        rate = whole * 1000 / 1001
+    frames = _frames(seconds, inside, number, dropped, table, at) * (whole / number)
     return np.round(frames, 6), rate, written[0]
 
 
@@ -239,11 +240,6 @@ def _numbers_per_second(
             hint="Omit --fps; --resample changes the rate of the motion." if counted else None,
         )
     return found
-
-
-def _is_of_ntsc(rate: float) -> bool:
-    """Return whether a frame rate is an NTSC rate, such as 29.97 = 30000 / 1001."""
-    return abs(rate - math.ceil(rate - _NTSC_SLACK) * 1000 / 1001) < _NTSC_SLACK
 
 
 def _dropped(seconds: NDArray[np.int64], inside: Array, number: int, marked: bool) -> int:

@@ -135,7 +135,9 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
         with open(temporary, "rb+") as written, _unless_unsupported():
             os.fsync(written.fileno())
         with _unless_unsupported():
-            os.chmod(temporary, 0o666 & ~_umask())
+            current = os.umask(0o022)  # the umask cannot be read without setting it
+            os.umask(current)
+            os.chmod(temporary, 0o666 & ~current)
         os.replace(temporary, target)
         _sync_folder(target.parent)
     except OSError as error:
@@ -182,13 +184,6 @@ def clear_unfinished(folder: str | os.PathLike[str]) -> None:
             shutil.rmtree(left, ignore_errors=True)
         else:
             left.unlink(missing_ok=True)
-
-
-def _umask() -> int:
-    # The umask cannot be read without setting it.
-    current = os.umask(0o022)
-    os.umask(current)
-    return current
 
 
 def _sync_folder(folder: Path) -> None:

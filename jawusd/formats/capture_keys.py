@@ -248,7 +248,7 @@ def _wrong_value(
         return f"{inside}{str(values.get('error', problem['msg'])).rstrip('.')}.", None
     if kind in ("tuple_type", "list_type") and isinstance(given, dict):
         return f"[{name}] is a single table; write [[{name}]], with double brackets, for each one.", None
-    field = _field_at(location, model)
+    field = _named(location[-1], _model_at(location[:-1], model)) if location else None
     below, many = (None, False) if field is None else table_model(field)
     key = Key("") if field is None else describe_key(field)
     if below is not None and not key.meaning and kind == "missing":
@@ -308,10 +308,6 @@ def _model_at(table: Location, model: type[BaseModel]) -> type[BaseModel] | None
             field = _named(part, at)
             at = None if field is None else table_model(field)[0]
     return at
-
-
-def _field_at(location: Location, model: type[BaseModel]) -> FieldInfo | None:
-    return _named(location[-1], _model_at(location[:-1], model)) if location else None
 
 
 def _named(key: int | str, model: type[BaseModel] | None) -> FieldInfo | None:

@@ -68,10 +68,11 @@ def numbered_files(pattern: Path) -> dict[int, Path]:
             continue
         number = int(digits)
         if number in found:
+            single = next(iter(groups([entry.name])), entry.name)
             raise CaptureError(
                 f"{found[number].name} and {entry.name} both have the number {number}.",
                 path=pattern,
-                hint=f"Write a pattern that matches only one of them, such as {_one_of(entry.name)}.",
+                hint=f"Write a pattern that matches only one of them, such as {single}.",
             )
         found[number] = entry
     if not found:
@@ -127,10 +128,6 @@ def gaps(numbers: Iterable[int]) -> str:
             out.append(f"{before + 1}" if after - before == 2 else f"{before + 1} to {after - 1}")
     more = f" and {len(out) - _GAPS_SHOWN} more gaps" if len(out) > _GAPS_SHOWN else ""
     return ", ".join(out[:_GAPS_SHOWN]) + more
-
-
-def _one_of(name: str) -> str:
-    return next(iter(groups([name])), name)
 
 
 def _offer(folder: Path) -> str:

@@ -25,7 +25,8 @@ Fault = tuple[str, Usd.Prim, str]  # severity ("error" or "warning"), prim, mess
 
 def faults_of_assembly(actor: Usd.Prim) -> Iterator[Fault]:
     """Yield those faults of a rig in its stage that the other rules do not find."""
-    yield from _muted(actor)
+    for name in actor.GetStage().GetMutedLayers():
+        yield "error", actor, f"the layer {name} is muted."
     yield from _units(actor)
     yield from _shape(actor)
     where = actor.GetStage().GetRootLayer().identifier
@@ -43,11 +44,6 @@ def faults_of_assembly(actor: Usd.Prim) -> Iterator[Fault]:
     yield from _resets(actor, [prim for prim in (skull, mandible) if prim])
     yield from _hidden(actor, skull, mandible)
     yield from _joints(actor, mandible)
-
-
-def _muted(actor: Usd.Prim) -> Iterator[Fault]:
-    for name in actor.GetStage().GetMutedLayers():
-        yield "error", actor, f"the layer {name} is muted."
 
 
 def _units(actor: Usd.Prim) -> Iterator[Fault]:
@@ -111,7 +107,8 @@ def _hidden(actor: Usd.Prim, skull: Usd.Prim | None, mandible: Usd.Prim) -> Iter
     if not meshes:
         yield "error", mandible, "has no active mesh."
         return
-    above = dict.fromkeys(prim for mesh in (*meshes, *skull_meshes) for prim in _with_ancestors(mesh))
+    paths = dict.fromkeys(path for mesh in (*meshes, *skull_meshes) for path in mesh.GetPath().GetPrefixes())
+    above = map(actor.GetStage().GetPrimAtPath, paths)
     imageable = [UsdGeom.Imageable(prim) for prim in above if prim.IsA(UsdGeom.Imageable)]
     times, keyed = key_and_frame_times(each.GetVisibilityAttr() for each in imageable)
     for time in time_codes(times[keyed]):
@@ -119,10 +116,6 @@ def _hidden(actor: Usd.Prim, skull: Usd.Prim | None, mandible: Usd.Prim) -> Iter
         if not any(_is_visible(mesh, time) for mesh in meshes) and any(_is_visible(p, time) for p in others):
             yield "error", mandible, f"is hidden at {time} while the rest of the actor is visible."
             return
-
-
-def _with_ancestors(prim: Usd.Prim) -> list[Usd.Prim]:
-    return [prim.GetStage().GetPrimAtPath(path) for path in prim.GetPath().GetPrefixes()]
 
 
 def _is_visible(prim: Usd.Prim, time: Usd.TimeCode) -> bool:

@@ -124,11 +124,13 @@ def key_times(attribute: Usd.Attribute) -> list[float]:
     spline = _spline_of(attribute)
     if spline is None:
         return list(attribute.GetTimeSamples())
-    knots = np.array(sorted(spline.GetKnots()))
-    first, last = np.ceil(knots.min(initial=np.inf)), np.floor(knots.max(initial=-np.inf))
-    if not last - first < MAX_FRAMES:
-        return knots.tolist()
-    return np.union1d(knots, np.arange(first, last + 1)).tolist()
+    return _with_frames(np.array(sorted(spline.GetKnots()))).tolist()
+
+
+def _with_frames(keys: Array) -> Array:
+    """Return increasing times with the whole frames between them, unless these are too many."""
+    first, last = np.ceil(keys.min(initial=np.inf)), np.floor(keys.max(initial=-np.inf))
+    return np.union1d(keys, np.arange(first, last + 1)) if 0 <= last - first < MAX_FRAMES else keys
 
 
 def values_at(attribute: Usd.Attribute, times: Iterable[float]) -> list[float | None]:
@@ -151,8 +153,7 @@ def _spline_of(attribute: Usd.Attribute) -> Ts.Spline | None:
 def key_and_frame_times(attributes: Iterable[Usd.Attribute]) -> tuple[Array, Mask]:
     """Return the times (n,) of samples of several attributes and whole frames between them, and a mask of samples."""
     keys = np.unique(np.concatenate([np.zeros(0), *(key_times(attribute) for attribute in attributes)]))
-    first, last = np.ceil(keys.min(initial=np.inf)), np.floor(keys.max(initial=-np.inf))
-    times = np.union1d(keys, np.arange(first, last + 1)) if 0 <= last - first < MAX_FRAMES else keys
+    times = _with_frames(keys)
     return times, np.isin(times, keys)
 
 

@@ -185,7 +185,7 @@ def _define_mesh(
     prim.CreateExtentAttr(layers.vec3f_array(extent(mesh.vertices)))
     prim.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
     prim.CreateDoubleSidedAttr(True)  # meshes are double-sided, because scans are open surfaces
-    prim.CreateNormalsAttr(layers.vec3f_array(corner_normals(mesh)))
+    prim.CreateNormalsAttr(layers.vec3f_array(vertex_normals(mesh)[mesh.faces.reshape(-1)]))
     prim.SetNormalsInterpolation(UsdGeom.Tokens.faceVarying)
     gum = ~crown_face_mask(mesh) if base == "Enamel" else np.zeros(len(mesh.faces), dtype=bool)
     write_look(prim, mesh, MATERIAL_LOOKS[base][0])
@@ -198,11 +198,6 @@ def _define_mesh(
             )
             UsdShade.MaterialBindingAPI.Apply(subset.GetPrim()).Bind(materials[name])
         binding.SetMaterialBindSubsetsFamilyType(UsdGeom.Tokens.partition)
-
-
-def corner_normals(mesh: Mesh) -> Array:
-    """Return smooth unit normals at every corner of every face, shape (3 F, 3)."""
-    return vertex_normals(mesh)[mesh.faces.reshape(-1)]
 
 
 def vertex_normals(mesh: Mesh) -> Array:

@@ -20,7 +20,7 @@ from jawusd.base.errors import RigError
 from jawusd.formats.mesh import Mesh, crown_face_mask
 from jawusd.geometry import so3_left_jacobian
 from jawusd.rig.bake import bake_rig
-from jawusd.rig.geo import corner_normals
+from jawusd.rig.geo import vertex_normals
 from jawusd.rig.table import SIZES, build_table, grid_axes, grid_points, sample_valid, table_error, valid_box
 
 GRAPHS = {"actor.onnx", "actor_encode.onnx"}
@@ -221,7 +221,7 @@ def test_unpainted_teeth_are_enamel():
 
 def test_normals_point_outward_like_those_of_trimesh():
     mesh = example_meshes()["mandible"]
-    ours = corner_normals(mesh).reshape(-1, 3, 3)
+    ours = vertex_normals(mesh)[mesh.faces]
     np.testing.assert_allclose(np.linalg.norm(ours, axis=-1), 1, atol=1e-12)
     theirs = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).vertex_normals[mesh.faces]
     assert np.einsum("fci,fci->fc", ours, theirs).min() > 0.99
@@ -229,7 +229,7 @@ def test_normals_point_outward_like_those_of_trimesh():
 
 def test_a_vertex_without_faces_and_a_degenerate_face_have_unit_normals():
     mesh = Mesh(np.array([[0, 0, 0], [1, 0, 0], [2, 0, 0], [5, 5, 5]]), np.array([[0, 1, 2]]))
-    np.testing.assert_allclose(np.linalg.norm(corner_normals(mesh), axis=1), 1)
+    np.testing.assert_allclose(np.linalg.norm(vertex_normals(mesh), axis=1), 1)
 
 
 def test_rig_without_skull_and_mandible_meshes(tmp_path, kind):
