@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections.abc import Callable
-from typing import Protocol
 
 import numpy as np
 
@@ -52,16 +51,6 @@ def _with_rotation(omega: Triple[Array], a: Array, b: Array) -> Array:
 
 Vector = tuple[float, float, float]
 Motion = tuple[float, ...]
-
-
-class SingleForm(Protocol):
-    """A model for one finite d."""
-
-    anchor: Vector
-
-    def motion(self, d1: float, d2: float, d3: float) -> Motion:
-        """Return M(d)."""
-        ...
 
 
 class SingleAnchored:
@@ -151,6 +140,9 @@ class SingleTwist:
         a, b, c = angle_coefficients(wx * wx + wy * wy + wz * wz)
         x, y, z = turning(omega, a, b)
         return *x, *y, *z, *apply_series(omega, (vx, vy, vz), b, c)
+
+
+SingleForm = SingleAnchored | SingleTwist
 
 
 class SingleCurve:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 import onnx
@@ -54,26 +53,12 @@ class ChartMotion:
     shift_x: Value  # derivatives of the displacement, one row for each coordinate, shape (n, 3, 3), or (1, 3, 3)
 
 
-class Chart(Protocol):
-    """The chart of one model."""
-
-    point: Array  # the reference point at rest, anatomical frame [mm], shape (3,)
-
-    def start(self, g: Graph, u: Value) -> Value:
-        """Return starting points (n, 3) for motions that displace the lower incisal point by u (n, 3) [mm]."""
-
-    def motion(self, g: Graph, x: Value) -> ChartMotion:
-        """Return the motions at chart coordinates x (n, 3) [mm]."""
-
-    def parameters(self, g: Graph, x: Value) -> Value:
-        """Return the d (n, 3) [mm] of chart coordinates x (n, 3) [mm]."""
-
-
 class AnchoredChart:
     """Chart whose coordinates are the displacement u of the lower incisal point; the spline maps u to the rotation."""
 
     def __init__(self, rig: JawRig) -> None:
         self._model = AnchoredModel.from_arrays(rig.arrays)
+        # point: the reference point at rest, anatomical frame [mm], shape (3,)
         self._gauge, self.point = self._model.gauge.numbers, self._model.incisor
 
     def start(self, g: Graph, u: Value) -> Value:
@@ -237,6 +222,7 @@ class AdditiveChart(ParameterChart):
         return ChartMotion(turning.rotation(g), g.op("MatMul", row, left), g.op("MatMul", omega_x, left), shift_x)
 
 
+Chart = AnchoredChart | ParameterChart
 #: Charts with exact derivatives, by kind; `ParameterChart` serves other kinds.
 CHARTS: dict[str, Callable[[JawRig], Chart]] = {ANCHORED: AnchoredChart, ADDITIVE: AdditiveChart}
 
