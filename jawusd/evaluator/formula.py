@@ -176,7 +176,7 @@ class BoundNumbers(NamedTuple):
 
 
 class BoundFormula:
-    """The slice hull: which jaw parameters are anatomically possible; tables and numbers as in `JawFormula`."""
+    """The slice hull: which jaw parameters are anatomically possible; tables, numbers as in `AnchoredFormula`."""
 
     def __init__(self, arrays: Arrays) -> None:
         knots, directions = arrays["slice_d1"], rows(arrays["slice_directions"], 2)

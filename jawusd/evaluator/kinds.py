@@ -7,7 +7,7 @@ This file imports only the standard library and modules that do the same: it is 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import ClassVar, Literal, NamedTuple, Protocol, cast
+from typing import ClassVar, Literal, NamedTuple, cast
 
 from jawusd.evaluator.curve_formula import curve, curve_tables, flat_ended_slopes, spline, spread_of
 from jawusd.evaluator.formula import (
@@ -21,7 +21,7 @@ from jawusd.evaluator.formula import (
     spline_input,
     twist_motion,
 )
-from jawusd.evaluator.operations import FloatOperations, Operations, Rows, Table, rows, triple
+from jawusd.evaluator.operations import FloatOperations, Operations, Table, rows, triple
 from jawusd.geometry.rodrigues import N, Triple
 
 
@@ -92,32 +92,6 @@ COMMON_OPTIONAL = {
 
 
 ANCHORED, ADDITIVE = "anchored", "additive"
-
-
-class JawFormula(Protocol):
-    """The motion of one kind of model."""
-
-    arrays: ClassVar[dict[str, ArraySpec]]  # the arrays that a rig of this kind has besides `COMMON`, by name
-    optional: ClassVar[dict[str, dict[str, ArraySpec]]]  # its optional groups of arrays besides `COMMON_OPTIONAL`
-    tables: dict[str, Rows]  # the rows of floats the formula needs; each number type stores them in its own form
-
-    def __init__(self, arrays: Arrays) -> None: ...
-
-    @property
-    def numbers(self) -> Numbers:
-        """The scalars the formula needs, in nested tuples."""
-
-    def motion(
-        self,
-        d: Triple[N],
-        tables: Mapping[str, Table],
-        ops: Operations[N, Table],
-        numbers: Numbers | None = None,
-    ) -> RigidMotion[N]:
-        """Return the motion away from the closed bite, anatomical frame, at the jaw parameters d [mm].
-
-        `tables` and `numbers` are those of the formula in the form of the number type; without numbers, its own floats.
-        """
 
 
 class AnchoredNumbers(NamedTuple):
@@ -191,7 +165,10 @@ class AnchoredFormula:
         ops: Operations[N, Table],
         numbers: Numbers | None = None,
     ) -> RigidMotion[N]:
-        """Return the motion away from the closed bite; see `JawFormula`."""
+        """Return the motion away from the closed bite, anatomical frame, at the jaw parameters d [mm].
+
+        `tables` and `numbers` are those of the formula in the form of the number type; without numbers, its own floats.
+        """
         gauge, incisor, scales, linear, offset, spread = cast("AnchoredNumbers", numbers or self.numbers)
         table = glide(self._glide_width, d[1], d[2], tables, ops) if self._glide_width else None
         u = displacement(gauge, d, ops, table)
@@ -229,13 +206,17 @@ class AdditiveFormula:
         ops: Operations[N, Table],
         numbers: Numbers | None = None,
     ) -> RigidMotion[N]:
-        """Return the motion away from the closed bite (see `JawFormula`); the model has no numbers."""
+        """Return the motion away from the closed bite (see `AnchoredFormula`); the model has no numbers."""
         first, second, third = (curve(f"curve{i}", x, tables, ops) for i, x in enumerate(d, start=1))
         twist = ops.split([x + y + z for x, y, z in zip(first, second, third)], 6)
         return twist_motion(triple(twist[:3]), triple(twist[3:]), ops)
 
 
-MODELS: dict[str, type[JawFormula]] = {ANCHORED: AnchoredFormula, ADDITIVE: AdditiveFormula}
+#: The kinds of models: `arrays` and `optional` are those that a rig has besides `COMMON` and `COMMON_OPTIONAL`.
+MODELS: dict[str, type[AnchoredFormula] | type[AdditiveFormula]] = {
+    ANCHORED: AnchoredFormula,
+    ADDITIVE: AdditiveFormula,
+}
 KINDS = tuple(MODELS)
 
 
