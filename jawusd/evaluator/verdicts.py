@@ -123,11 +123,6 @@ class Limits:
     tolerance_mm: float
     speed_mm_s: float | None = None  # largest speed of any landmark since the last valid pose; None disables the check
 
-    @property
-    def margin_mm(self) -> float:
-        """The smallest margin of a valid pose."""
-        return -self.tolerance_mm
-
     def replaced(self, residual_mm: float | None, tolerance_mm: float | None, speed_mm_s: float | None) -> Limits:
         """Return the limits, with the given ones replaced.
 
@@ -155,7 +150,7 @@ def judge(finite: Mask, rigid: Mask, residual_mm: Array, margin_mm: Array, d: Ar
 
 
 def _outside(margin_mm: Array, limits: Limits) -> Mask:
-    return ~(margin_mm >= limits.margin_mm - ON_BOUND_MM)
+    return ~(margin_mm >= -limits.tolerance_mm - ON_BOUND_MM)
 
 
 def exceeds(moved_mm: Array, elapsed_s: ArrayLike, limit_mm_s: float) -> Mask:

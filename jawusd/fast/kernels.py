@@ -259,7 +259,8 @@ class CompiledKernels(NumpyKernels):
     def judge_poses(self, T: Array, limits: Limits) -> Verdicts:
         """Return verdicts on poses T_skull_mandible (n, 4, 4)."""
         out = np.empty((len(T), 6))
-        judge_rows(self._packed_model, self._packed_bound, _owned(T), True, limits.residual_mm, limits.margin_mm, out)
+        residual_mm, margin_mm = limits.residual_mm, -limits.tolerance_mm
+        judge_rows(self._packed_model, self._packed_bound, _owned(T), True, residual_mm, margin_mm, out)
         reason = out[:, 5]  # `logical_not` is three times as fast as `== 0`
         return Verdicts(np.logical_not(reason), reason.astype(np.uint8), out[:, 3], out[:, 4], out[:, :3])
 
