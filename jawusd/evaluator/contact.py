@@ -165,26 +165,17 @@ class RigClearance:
             EvaluatorError: The rig has no such clearance; see `contact` and `joints`.
             ValueError: ``of`` is neither "teeth" nor "condyles".
         """
-        field = self._field(of)
-        rows, batch = rows_of(d, (3,), "d")
-        value, gradient = pairs_in_chunks(field.clearance, rows)
-        return Clearance(value.reshape(batch), gradient.reshape(*batch, 3))
-
-    def _field(self, of: Meeting) -> ContactField:
         if of not in PREFIXES:
             raise ValueError(f'of must be "teeth" or "condyles", got {of!r}')
         field = self.contact if of == "teeth" else self.joints
-        if field is not None:
-            return field
-        if of == "teeth":
-            raise EvaluatorError(
-                "this rig has no clearance data for the teeth.",
-                hint="Fit or bake it with scans of both dental arches in occlusion.",
-            )
-        raise EvaluatorError(
-            "this rig has no clearance data for the condyles.",
-            hint="Fit or bake it with meshes of skull and mandible that include the joints.",
-        )
+        if field is None:
+            needed = "scans of both dental arches in occlusion"
+            if of == "condyles":
+                needed = "meshes of skull and mandible that include the joints"
+            raise EvaluatorError(f"this rig has no clearance data for the {of}.", hint=f"Fit or bake it with {needed}.")
+        rows, batch = rows_of(d, (3,), "d")
+        value, gradient = pairs_in_chunks(field.clearance, rows)
+        return Clearance(value.reshape(batch), gradient.reshape(*batch, 3))
 
 
 def check_contact(arrays: Mapping[str, Array], name: str) -> None:

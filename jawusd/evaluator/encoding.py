@@ -156,7 +156,7 @@ class Encoder:
 
     def encode(self, T: Array) -> tuple[Array, Array]:
         """Return the d (n, 3) nearest to poses T_skull_mandible (n, 4, 4), and the residuals (n,) [mm]."""
-        d = self.nearest(T)
+        d = self.model.chart_parameters(nearest_in_chart(self.model, *self.frames.motions(T), self.vectors))
         return d, self.residual_mm(d, T)
 
     def targets(self, T: Array) -> Array:
@@ -167,11 +167,6 @@ class Encoder:
         """Return the landmark distances (n,) [mm] between the poses of d (n, 3) and T (n, 4, 4)."""
         difference = vector_images(*self.model.decode(d), self.vectors) - self.targets(T)
         return np.sqrt(np.einsum("nij,nij->n", difference, difference))
-
-    def nearest(self, T: Array) -> Array:
-        """Return the d (n, 3) nearest to poses T_skull_mandible (n, 4, 4)."""
-        R, t = self.frames.motions(T)
-        return self.model.chart_parameters(nearest_in_chart(self.model, R, t, self.vectors))
 
     def most_likely(self, T: Array, whitening: Array, start: Array, bound: SliceHull | None) -> Array:
         """Return the most likely d (n, 3) of noisy poses T (n, 4, 4): minimise ``|W xi|^2``, ``T = exp(xi) pose(d)``.

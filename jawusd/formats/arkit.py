@@ -159,11 +159,9 @@ def _check_weights(weights: Array, shapes: list[int], table: TextTable) -> None:
     worst = float(weights[row, column])
     if _LEAST_WEIGHT <= worst <= _MOST_WEIGHT or not np.isfinite(worst):
         return
-    hint = (
-        "These look like percentages: divide all weights by 100."
-        if worst > _PERCENT
-        else ("Export the weights as recorded, not normalised or scaled.")
-    )
+    hint = "Export the weights as recorded, not normalised or scaled."
+    if worst > _PERCENT:
+        hint = "These look like percentages: divide all weights by 100."
     raise FormatError(
         f"{table.named(int(row), shapes[column])} is {worst:g}; ARKit weights range from 0 to 1; values "
         f"from {_LEAST_WEIGHT:g} to {_MOST_WEIGHT:g} are accepted.",

@@ -84,9 +84,7 @@ def capture_text(sketch: CaptureSketch) -> str:
 
 
 def _text(value: object) -> str:
-    return json.dumps(
-        str(PurePath(value).as_posix()) if isinstance(value, PurePath) else str(value), ensure_ascii=False
-    )
+    return json.dumps(value.as_posix() if isinstance(value, PurePath) else str(value), ensure_ascii=False)
 
 
 def _number(key: str, value: float | None, example: str, meaning: str) -> str:
@@ -115,10 +113,8 @@ def _scans(scans: Mapping[str, PurePath]) -> Iterable[str]:
     yield ""
 
 
-def _cameras(cameras: Iterable[CameraSketch]) -> Iterable[str]:
-    none = True
+def _cameras(cameras: tuple[CameraSketch, ...]) -> Iterable[str]:
     for camera in cameras:
-        none = False
         yield "[[camera]]" + (f"  # {camera.remark}" if camera.remark else "")
         yield f"name = {_text(camera.name)}"
         if camera.video is not None:
@@ -129,7 +125,7 @@ def _cameras(cameras: Iterable[CameraSketch]) -> Iterable[str]:
             elif camera.masks:
                 yield f'{FILL} masks.{arch} = "{arch}/%06d.png"'
         yield ""
-    if none:
+    if not cameras:
         yield f'{FILL} for each camera: [[camera]], name = "left", video = "left.mp4"'
         yield ""
 
