@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jawusd.base.arrays import Array, Indices, Mask
+from jawusd.base.arrays import Array, Mask
 from jawusd.evaluator.bounds import SliceHull
 from jawusd.evaluator.curves import interpolate_linear
 from jawusd.evaluator.spine import INSET_MM, Spine, distances, moved_to_spine
@@ -163,19 +163,14 @@ def _leaves(bound: SliceHull, start: Array, end: Array) -> Mask:
     first = np.cumsum(count) - count
     worst = np.maximum.reduceat(distance, first) if len(near) else distance
     close = np.flatnonzero((worst > -_NEAR_MM) & (worst <= _ROUNDING_MM))
-    at = share[first[close] + _positions(distance == worst[line], first, count)[close]]
+    place = np.where(distance == worst[line], np.arange(len(line)), -1)
+    at = share[(np.maximum.reduceat(place, first) if len(near) else first)[close]]
     for shift in np.linspace(-1.0, 1.0, 17):  # look at points around the sample with the smallest margin
         closer = np.clip(at + shift / count[close], 0.0, 1.0)
         nearer = distances(bound, start[close] + closer[:, None] * offset[close])
         worst[close] = np.maximum(worst[close], nearer)
     found[near[worst > _ROUNDING_MM]] = True
     return found
-
-
-def _positions(marked: Mask, first: Indices, count: Indices) -> Indices:
-    """Return the position of the last marked entry within each group of consecutive entries."""
-    place = np.where(marked, np.arange(len(marked)), -1)
-    return np.maximum.reduceat(place, first) - first if len(count) else first
 
 
 def lengths(path: Array) -> Array:

@@ -301,7 +301,6 @@ def _keys(model: type[BaseModel] | None) -> list[str]:
 
 
 def _model_at(table: Location, model: type[BaseModel]) -> type[BaseModel] | None:
-    """Return the model of the table at a location."""
     at: type[BaseModel] | None = model
     for part in table:
         if isinstance(part, str):

@@ -53,7 +53,6 @@ def read_toml(path: str | os.PathLike[str]) -> dict[str, object]:
 
 
 def _not_toml(text: str, said: str) -> tuple[str, str]:
-    """Return the message and hint for an error of tomllib."""
     place = re.search(r" \(at line (\d+), column \d+\)$", said)
     line = text.split("\n")[int(place[1]) - 1].strip() if place else ""
     if place:

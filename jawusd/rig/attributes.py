@@ -81,7 +81,6 @@ def read_arrays(prim: Usd.Prim, kind: str, where: object) -> dict[str, Array]:
 
 
 def _optional_arrays(prim: Usd.Prim, kind: str) -> dict[str, ArraySpec]:
-    """Return the optional arrays that a rig prim has."""
     found: dict[str, ArraySpec] = {}
     for first, group in optional_of(kind).items():
         if prim.GetAttribute(group[first].attribute or "").HasAuthoredValue():

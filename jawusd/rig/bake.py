@@ -96,7 +96,6 @@ def add_detail_variants(actor: Sdf.PrimSpec, proxies: Iterable[str]) -> None:
 
 
 def _proxy_path(name: str) -> str:
-    """Return the path of a mesh's proxy, next to the mesh."""
     return f"{MESH_PATHS[name].removesuffix('Mesh')}Proxy"
 
 

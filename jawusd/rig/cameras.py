@@ -91,7 +91,6 @@ def write_cameras(
 
 
 def _camera_layer(cameras: Sequence[Camera], fps: float, light: Container[str], out: Path) -> Sdf.Layer:
-    """Return a layer with the cameras of a take."""
     names = [Sdf.Path(TAKE_CAMERAS).AppendChild(_prim_name(camera.name)) for camera in cameras]
     if not names or len(set(names)) < len(names):
         raise RigError("a stage needs cameras with unique names.", path=out)
