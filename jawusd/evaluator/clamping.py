@@ -20,9 +20,8 @@ MAX_STRETCH = 1.045  # maximum factor by which a step may grow: 5 %, less an all
 
 _SAMPLE_MM = 0.2  # sample spacing [mm] near the bound
 _MAX_PIECES = 400  # maximum number of samples in one step
-_STEEPEST = (
-    5.0  # maximum gradient norm of the margin: a step stays inside with at least this times its length as margin
-)
+# Maximum gradient norm of the margin: a step stays inside if the margin at its ends is at least this times its length.
+_STEEPEST = 5.0
 _STILL_MM = 1e-12
 _TIME_SHARE = 0.998  # fraction of the available time that a path may take; finer sampling lengthens the path slightly
 # Lines between samples are checked at points `_CHECK_MM` apart, and more finely where the margin is below `_NEAR_MM`.

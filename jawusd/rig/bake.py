@@ -60,9 +60,8 @@ def _with_ordered_fields(layer: Sdf.Layer) -> Sdf.Layer:
 
 def _define_proxy_class(layer: Sdf.Layer, proxies: Iterable[str]) -> None:
     """Define the class with the proxies under new names; binary layers store the equal arrays only once."""
-    Sdf.CopySpec(
-        layer, layout.ACTOR, layer, _PROXY_CLASS
-    )  # the copy includes the materials to which the meshes are bound
+    # the copy includes the materials to which the meshes are bound
+    Sdf.CopySpec(layer, layout.ACTOR, layer, _PROXY_CLASS)
     layer.GetPrimAtPath(_PROXY_CLASS).specifier = Sdf.SpecifierClass
     mandible = layer.GetPrimAtPath(layout.MANDIBLE.replace(layout.ACTOR, _PROXY_CLASS))
     for attribute in list(mandible.properties):
