@@ -1,7 +1,6 @@
 """Fit jaw models to captured poses: decoder, bounds, error tables, and checks of the data.
 
-The inputs are poses, not images, as `formats.tracks.Tracks` or arrays. This package must not import another stage
-(capture, tracking, paper, rig, ...); `pipeline` and `paper` import it.
+The inputs are poses, not images, as `formats.tracks.Tracks` or arrays.
 """
 
 from jawusd.fitting.fit import FittingConfig, fit_model

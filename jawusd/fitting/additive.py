@@ -130,12 +130,7 @@ class _Basis:
 
 
 def fit_additive(data: TrainingData, shown: Mask, trim_mad: float) -> FittedForm:
-    """Fit the sum of three curves.
-
-    Args:
-        shown: mask of the parameters that the data excite, shape (3,); the curves of the others are pure translations.
-        trim_mad: see `FittingConfig`.
-    """
+    """Fit the sum of three curves; those of parameters not shown (3,) by the data are pure translations."""
     u = data.displacement()
     t = fit_gauge(u, data.weights, fit_path(u, data.weights), shown).gauge.inverse(u)
     kept = np.all(np.isfinite(t), axis=1)
@@ -225,14 +220,9 @@ def _curve(basis: _Basis, turn: Array, glide: Array, incisor: Array, axis: int) 
 def fit_pca(data: TrainingData, shown: Mask) -> FittedForm:
     """Fit a linear subspace of se(3) through the closed bite to all frames.
 
-    The subspace is spanned by the first principal components of log M, one per shown parameter. The data are not
-    centred, so that d = 0 is the closed bite. The basis follows from the incisal velocity: to first order, d2 and d3
-    move the incisal point purely sideways and forward, and d1 along the mean opening direction of the take.
-
-    The note `singular_values_mm` lists the singular values of the weighted twists, as rms displacement of the mandible.
-
-    Args:
-        shown: parameters that the data excite, shape (3,); the other parameters become pure translations.
+    The subspace is spanned by the first principal components of log M, one per parameter shown (3,) by the data; other
+    parameters are pure translations. The basis follows from the incisal velocity: to first order, d2 and d3 move the
+    incisal point purely sideways and forward, and d1 along the mean opening direction of the take.
 
     Raises:
         FittingError: the components do not move the incisal point in independent directions.

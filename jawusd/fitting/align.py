@@ -69,7 +69,7 @@ def align(
         joint: Jaw joint of the model [model units], (3,), to store with the alignment.
 
     Returns:
-        The alignment: `T_skull_model`, `unit_mm`, its covariance, and its expected error at teeth and condyles.
+        The alignment, with its covariance and its expected error at teeth and condyles.
 
     Raises:
         FittingError: fewer than three points, points on a line, points that the rig does not provide, points that

@@ -27,7 +27,7 @@ from jawusd.base.arrays import Array, Mask
 from jawusd.evaluator.gauge import Gauge
 from jawusd.evaluator.models import AnchoredModel
 from jawusd.fitting.data import MODEL_SIGMA_MM, FittedForm, TrainingData, displacement
-from jawusd.fitting.gauge_fit import fit_gauge, fit_path
+from jawusd.fitting.gauge_fit import fit_gauge, fit_path, sheared
 from jawusd.fitting.spline import SplineBasis, choose_smoothing, farthest_points, folds_of, ridge_solve, within
 from jawusd.geometry import make_transform, so3_exp, so3_log
 
@@ -60,8 +60,8 @@ _GUIDED_SHARE = 0.08
 class CondylarGuidance:
     """Learned paths of the left and right condyle, in the anatomical frame."""
 
-    incisor: Array  # Lower incisal point at rest [mm], shape (3,).
-    centres: Array  # Kinematic centres at rest [mm], shape (2, 3).
+    incisor: Array  # lower incisal point at rest [mm], shape (3,)
+    centres: Array  # kinematic centres at rest [mm], shape (2, 3)
     slopes: Array  # polynomial coefficients of the height as a function of the slide, shape (2, 4) [mm]
     slide_range: Array  # range of the captured slides [mm], per condyle, shape (2, 2)
     shift: Array  # coefficients of the sideways movement of the condyles' midpoint [mm], shape (5,)
@@ -83,14 +83,9 @@ class CondylarGuidance:
         return replace(guidance, misfit_mm=float(misfit))
 
     def rotation(self, u: Array, start: Array) -> tuple[Array, Mask]:
-        """Return the rotations that satisfy the condylar equations at incisal displacements u (N, 3) [mm].
+        """Return rotation vectors (N, 3) [rad] that satisfy the condylar equations at displacements u (N, 3) [mm].
 
-        Args:
-            start: rotation vectors to start from [rad], shape (N, 3).
-
-        Returns:
-            Rotation vectors (N, 3) [rad], and a mask of those that converged with slides near the captured slides,
-            shape (N,).
+        `start` (N, 3) are rotation vectors to start from. Also returns which converged near captured slides, (N,).
         """
         R = so3_exp(start)
         for _ in range(_NEWTON_STEPS):
@@ -169,25 +164,19 @@ def _ridge_fit(columns: Array, values: Array, weights: Array) -> Array:
 
 
 def fit_anchored(data: TrainingData, shown: Mask, trim_mad: float) -> FittedForm:
-    """Fit the anchored model.
-
-    Args:
-        shown: which of opening, laterotrusion and protrusion the data excite, shape (3,); the fitted function f does
-            not depend on the other parameters.
-        trim_mad: see `FittingConfig`.
-    """
+    """Fit the anchored model; f depends only on the parameters shown (3,), which the data excite."""
     u = data.displacement()
     path = fit_path(u, data.weights)
-    chart = _Chart(path, np.where(shown, _SCALES_MM, _HIDDEN_SCALE_MM))
+    scales = np.where(shown, _SCALES_MM, _HIDDEN_SCALE_MM)
     kept = np.ones(len(data), dtype=bool)
     for _ in range(_ROUNDS):
         fitted = kept
-        model, smoothing = _regress(data, u, fitted, chart, guided=bool(shown.all()))
+        model, smoothing = _regress(data, u, fitted, path, scales, guided=bool(shown.all()))
         d, nearest = data.metric.nearest(model, data.motion)
-        u = chart.path.displacement(d)
+        u = path.displacement(d)
         kept = within(data.metric.rms(nearest, data.motion), trim_mad, _TRIM_FLOOR_MM)
     found = fit_gauge(u[fitted], data.weights[fitted], path, shown)
-    model = AnchoredModel(found.gauge, data.incisor, chart.scales, model.centres, model.weights)
+    model = AnchoredModel(found.gauge, data.incisor, scales, model.centres, model.weights)
     notes: dict[str, object] = {
         "centres": len(model.centres),
         "smoothing": smoothing,
@@ -197,37 +186,19 @@ def fit_anchored(data: TrainingData, shown: Mask, trim_mad: float) -> FittedForm
     return FittedForm(model, fitted, notes)
 
 
-@dataclass(frozen=True)
-class _Chart:
-    """Map from incisal displacements u (N, 3) [mm] to spline arguments q (N, 3).
-
-    The map is a shear along the habitual path, followed by a scaling.
-    """
-
-    path: Gauge
-    scales: Array
-
-    def of(self, u: Array) -> Array:
-        gx, gz, _, _ = self.path.path(-u[:, 1])
-        return np.stack([-u[:, 1], u[:, 0] - gx, u[:, 2] - gz], axis=1) / self.scales
-
-    def displacement(self, q: Array) -> Array:
-        opening, side, front = (q * self.scales).T
-        gx, gz, _, _ = self.path.path(opening)
-        return np.stack([side + gx, -opening, front + gz], axis=1)
-
-
-def _regress(data: TrainingData, u: Array, kept: Mask, chart: _Chart, guided: bool) -> tuple[AnchoredModel, float]:
+def _regress(
+    data: TrainingData, u: Array, kept: Mask, path: Gauge, scales: Array, guided: bool
+) -> tuple[AnchoredModel, float]:
     """Fit the map f from u to the rotation that best explains each frame's pose with the incisal point fixed at u.
 
     The smoothing factor is chosen again in every call, since f may be less stiff once outliers are trimmed.
     """
     rotation = data.metric.best_rotation(data.motion, data.incisor, u + data.incisor)[kept]
-    omega, q, weights = so3_log(rotation), chart.of(u[kept]), data.weights[kept]
+    omega, q, weights = so3_log(rotation), sheared(u[kept], path) / scales, data.weights[kept]
     folds = folds_of(len(data))[kept]
     if guided:
         motion = make_transform(rotation, u[kept] + data.incisor - rotation @ data.incisor)
-        more = _guided_rows(data, motion, weights, chart)
+        more = _guided_rows(data, motion, weights, path, scales)
         omega, q, weights = (np.concatenate(pair) for pair in zip((omega, q, weights), more, strict=True))
         folds = np.append(folds, np.full(len(q) - len(folds), -1))
     # The values are in mm: |L^T domega|^2 is the mean squared displacement of the mandible about the incisal point.
@@ -242,21 +213,23 @@ def _regress(data: TrainingData, u: Array, kept: Mask, chart: _Chart, guided: bo
     weighted = columns * weights[:, None]
     fitted = ridge_solve(weighted.T @ columns, weighted.T @ values, smoothing * basis.energy + tail)
     spline = basis.weights(np.linalg.solve(L.T, fitted.T).T)
-    return AnchoredModel(chart.path, data.incisor, chart.scales, basis.centres, spline), smoothing
+    return AnchoredModel(path, data.incisor, scales, basis.centres, spline), smoothing
 
 
-def _guided_rows(data: TrainingData, motion: Array, weights: Array, chart: _Chart) -> tuple[Array, Array, Array]:
+def _guided_rows(
+    data: TrainingData, motion: Array, weights: Array, path: Gauge, scales: Array
+) -> tuple[Array, Array, Array]:
     """Return rotation vectors (G, 3), spline arguments (G, 3) and weights (G,) predicted from the condylar paths.
 
-    The predictions fill the box around the captured poses. Their total weight is a few percent of the total weight of
-    the poses, so that they matter only where there are no poses.
+    The predictions fill the box around the captured poses, with a low total weight.
     """
     guidance = CondylarGuidance.of_motion(motion, weights, data.incisor, data.landmarks[-2:])
-    q = chart.of(motion[:, :3, :3] @ data.incisor + motion[:, :3, 3] - data.incisor)
+    q = sheared(displacement(motion, data.incisor), path) / scales
     axes = [np.linspace(low, high, n) for low, high, n in zip(q.min(0), q.max(0), _GUIDED_GRID, strict=True)]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     nearest = cKDTree(q).query(grid)[1]
-    omega, found = guidance.rotation(chart.displacement(grid), so3_log(motion[nearest, :3, :3]))
+    # The path alone is a gauge without arch and glide surface, whose d is the sheared displacement.
+    omega, found = guidance.rotation(path.displacement(grid * scales), so3_log(motion[nearest, :3, :3]))
     trust = MODEL_SIGMA_MM**2 / (MODEL_SIGMA_MM**2 + guidance.misfit_mm**2)
     weight = _GUIDED_SHARE * trust * weights.sum() / max(int(found.sum()), 1)
     return omega[found], grid[found], np.full(int(found.sum()), weight)

@@ -4,11 +4,9 @@ Alpha shapes of (d1, d2) and (d1, d3): a Delaunay triangle belongs to the shape 
 after both axes have been divided by the captured range (Edelsbrunner, Kirkpatrick & Seidel 1983 with r = alpha). The
 paper's alpha of 0.12 is in units of its network's components, whose ranges are not published.
 
-Slice hull: a convex section in (laterotrusion, protrusion), in mm, for every opening. A tight alpha shape in three
-dimensions would be hollow, since border movements leave the inside of the envelope empty. Sections of the envelope at
-one opening are nearly convex, so the support function of the captured poses near that opening, smoothed over the
-opening, describes them with few parameters. The hull is tight around the captured poses, so that every pose a slider
-reaches is anatomical; the tolerance for measured poses is estimated by cross-validation.
+Slice hull: a convex section in (laterotrusion, protrusion), in mm, for every opening: the support function of the
+captured poses near that opening, smoothed over the opening. A tight alpha shape in three dimensions would be hollow,
+since border movements leave the inside of the envelope empty.
 """
 
 from __future__ import annotations
@@ -16,6 +14,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
+from scipy.ndimage import gaussian_filter1d
 from scipy.spatial import Delaunay, QhullError
 from shapely import MultiPoint, Polygon, polygons, union_all
 from shapely.geometry.polygon import orient
@@ -144,11 +143,9 @@ def _hull(d: Array, closed_mm: float | None) -> dict[str, Array]:
 
 
 def _section(distance: Array, reach: Array) -> Array:
-    """Return the support values (K,) of one section [mm].
+    """Return the support values (K,) of one section [mm], from the reach (N, K) of frames along each direction [mm].
 
-    Args:
-        distance: difference in opening between the frames and the section, in units of the window, shape (N,).
-        reach: coordinates of the frames along each direction [mm], shape (N, K).
+    `distance` (N,) is the difference in opening between the frames and the section, in units of the window.
     """
     order = np.argsort(distance, kind="stable")
     count = max(int((distance < 1.0).sum()), min(_FEWEST_IN_WINDOW, len(distance)))
@@ -159,7 +156,4 @@ def _section(distance: Array, reach: Array) -> Array:
 
 
 def _smoothed(support: Array) -> Array:
-    half = int(np.ceil(3 * _KERNEL_KNOTS))
-    kernel = np.exp(-0.5 * (np.arange(-half, half + 1) / _KERNEL_KNOTS) ** 2)
-    padded = np.pad(support, ((half, half), (0, 0)), mode="edge")
-    return np.stack([np.convolve(column, kernel / kernel.sum(), mode="valid") for column in padded.T], axis=-1)
+    return np.asarray(gaussian_filter1d(support, _KERNEL_KNOTS, axis=0, mode="nearest", truncate=3.0))

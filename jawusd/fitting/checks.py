@@ -12,7 +12,7 @@ import numpy as np
 
 from jawusd.base.arrays import Array, Mask
 from jawusd.fitting.data import PARAMETERS, SubjectAnatomy, TrainingData, displacement
-from jawusd.fitting.gauge_fit import SMALLEST_OPENING_MM, fit_path
+from jawusd.fitting.gauge_fit import SMALLEST_OPENING_MM, fit_path, sheared
 from jawusd.geometry import landmark_frame, se3_inverse, so3_log
 
 _OPENING_MAX_MM = 75.0
@@ -67,26 +67,20 @@ def _frame_mistake(data: TrainingData) -> AnatomyWarning | None:
     incisor, molar_left, molar_right, condyle_left, condyle_right = data.landmarks
     apart = float(np.linalg.norm(condyle_left - condyle_right))
     if not _CONDYLES_APART_MM[0] <= apart <= _CONDYLES_APART_MM[1]:
-        return AnatomyWarning(
-            "scan_units",
-            f"The condyles are {apart:.4g} mm apart (human: 70-140 mm): the scans are probably not in mm.",
-        )
+        message = f"The condyles are {apart:.4g} mm apart (human: 70-140 mm): the scans are probably not in mm."
+        return AnatomyWarning("scan_units", message)
     behind = min(incisor[2] - condyle_left[2], incisor[2] - condyle_right[2])
     if behind < 0:
-        return AnatomyWarning(
-            "front_back_flip", f"The condyles lie {-behind:.0f} mm in front of the incisors: z must point forward."
-        )
+        message = f"The condyles lie {-behind:.0f} mm in front of the incisors: z must point forward."
+        return AnatomyWarning("front_back_flip", message)
+    swapped = "Left and right landmarks are swapped:"
     if condyle_left[0] < condyle_right[0] or molar_left[0] < molar_right[0]:
-        return AnatomyWarning(
-            "left_right_flip",
-            "Left and right landmarks are swapped: in the anatomical frame x must point to the subject's left.",
-        )
+        message = f"{swapped} in the anatomical frame x must point to the subject's left."
+        return AnatomyWarning("left_right_flip", message)
     if min(condyle_left[1], condyle_right[1]) < incisor[1]:
         if np.allclose(landmark_frame(data.landmarks)[:3, :3], np.eye(3), atol=_SAME_FRAME):
-            return AnatomyWarning(
-                "left_right_flip",
-                "Left and right landmarks are swapped: the frame derived from them puts the condyles below.",
-            )
+            message = f"{swapped} the frame derived from them puts the condyles below."
+            return AnatomyWarning("left_right_flip", message)
         return AnatomyWarning("upside_down", "The condyles lie below the incisal point: y must point up.")
     return None
 
@@ -134,24 +128,20 @@ def _out_of_range(data: TrainingData) -> list[AnatomyWarning]:
     travel = np.linalg.norm([displacement(data.motion, condyle) for condyle in data.landmarks[3:]], axis=-1)
     turned = np.rad2deg(np.linalg.norm(so3_log(data.motion[:, :3, :3]), axis=-1))
     found = [
-        ("opening", float(np.percentile(-u[:, 1], _QUANTILE)), _OPENING_MAX_MM, "mm"),
-        ("rise", float(np.percentile(u[:, 1], _QUANTILE)), _RISE_MAX_MM, "mm"),
-        ("laterotrusion", float(np.percentile(np.abs(u[:, 0]), _QUANTILE)), _LATERAL_MAX_MM, "mm"),
-        ("protrusion", float(np.percentile(forward, _QUANTILE)), _PROTRUSION_MAX_MM, "mm"),
-        ("retrusion", float(np.percentile(-forward, _QUANTILE)), _RETRUSION_MAX_MM, "mm"),
-        ("rotation", float(np.percentile(turned, _QUANTILE)), _ROTATION_MAX_DEG, "deg"),
-        (
-            "condylar translation",
-            float(np.percentile(travel, _QUANTILE)),
-            _CONDYLE_MAX_MM,
-            "mm",
-        ),
+        ("opening", -u[:, 1], _OPENING_MAX_MM, "mm"),
+        ("rise", u[:, 1], _RISE_MAX_MM, "mm"),
+        ("laterotrusion", np.abs(u[:, 0]), _LATERAL_MAX_MM, "mm"),
+        ("protrusion", forward, _PROTRUSION_MAX_MM, "mm"),
+        ("retrusion", -forward, _RETRUSION_MAX_MM, "mm"),
+        ("rotation", turned, _ROTATION_MAX_DEG, "deg"),
+        ("condylar translation", travel, _CONDYLE_MAX_MM, "mm"),
     ]
+    extremes = [(name, float(np.percentile(values, _QUANTILE)), limit, unit) for name, values, limit, unit in found]
     return [
         AnatomyWarning(
             f"{name.replace(' ', '_')}_range", f"{name.capitalize()} is {value:.1f} {unit} (human: up to {limit:g})."
         )
-        for name, value, limit, unit in found
+        for name, value, limit, unit in extremes
         if value > limit
     ]
 
@@ -159,13 +149,12 @@ def _out_of_range(data: TrainingData) -> list[AnatomyWarning]:
 def shown_parameters(data: TrainingData) -> tuple[Mask, list[str]]:
     """Return which parameters (3,) the poses excite, and a sentence for each parameter that they do not excite."""
     u = data.displacement()
-    gx, gz, _, _ = fit_path(u, data.weights).path(-u[:, 1])
-    side, front = u[:, 0] - gx, u[:, 2] - gz
+    opening, side, front = sheared(u, fit_path(u, data.weights)).T
     if _range(side) >= _SMALLEST_RANGE_MM[1]:
         # A lateral excursion also moves the jaw forward; only motion beyond that is protrusion.
         arch = np.stack([np.abs(side), side, side**2], axis=-1)
         front = front - arch @ np.linalg.lstsq(arch, front, rcond=None)[0]
-    spread = np.array([_range(values) for values in (-u[:, 1], side, front)])
+    spread = np.array([_range(values) for values in (opening, side, front)])
     shown = spread >= _SMALLEST_RANGE_MM
     sentences = [
         f"The poses do not show {name}: it varies by {spread[i]:.1f} mm (at least {_SMALLEST_RANGE_MM[i]:g} mm are "
@@ -182,12 +171,7 @@ def _range(values: Array) -> float:
 
 
 def missing_movements(d: Array, shown: Mask) -> list[str]:
-    """Return a sentence for each missing movement, with advice on what to record.
-
-    Args:
-        d: parameters of the captured poses [mm], shape (N, 3).
-        shown: parameters that the data excite, shape (3,); `shown_parameters` reports the other parameters.
-    """
+    """Return a sentence with advice for each missing movement of the captured d (N, 3) [mm] along parameters shown."""
     widest = float(d[:, 0].max())
     found = []
     if shown[0]:

@@ -28,10 +28,7 @@ _FEWEST_POSES = 15
 _SMALLEST_MOTION_MM = 1.0  # minimum 95 % quantile of the mandible's rms displacement from the first pose [mm]
 
 _FEWEST = 60  # minimum number of poses for outlier screening
-_TRIALS, _SAMPLE = (
-    300,
-    15,
-)  # number of random samples, and number of poses in a sample; each output component has ten unknowns
+_TRIALS, _SAMPLE = 300, 15  # numbers of random samples and of their poses; each output component has ten unknowns
 _CONSENSUS = 0.75  # minimum fraction of the poses that must agree with the quadratic map
 _REFITS = 3
 # Outlier thresholds: relative to the majority's spread, and absolute [mm, rms over the mandible]. A real jaw deviates
@@ -58,11 +55,7 @@ class SubjectAnatomy:
         mandible_vertices: ArrayLike | None,
         T_rest: ArrayLike | None,
     ) -> SubjectAnatomy:
-        """Check the arrays; by default, the points are the landmarks and the closed bite is the identity.
-
-        Raises:
-            ValueError: an array has a wrong shape or is not finite.
-        """
+        """Check the arrays; by default, the points are the landmarks and the closed bite is the identity."""
         landmarks = _array(landmarks, (len(LANDMARKS), 3), "landmarks")
         vertices = landmarks if mandible_vertices is None else mandible_vertices
         return cls(
@@ -91,8 +84,8 @@ class TrainingData:
 
     frames: NDArray[np.int64]
     motion: Array  # motions away from the closed bite, anatomical frame, shape (N, 4, 4)
-    weights: Array  # Weight of each pose, 0 .. 1, shape (N,).
-    incisor: Array  # Lower incisal point in the closed bite, anatomical frame [mm], shape (3,).
+    weights: Array  # weight of each pose, 0 .. 1, shape (N,)
+    incisor: Array  # lower incisal point in the closed bite, anatomical frame [mm], shape (3,)
     landmarks: Array  # all landmarks in the closed bite, anatomical frame [mm], shape (5, 3)
     metric: MandibleMetric  # metric of pose differences, in the anatomical frame
 
@@ -119,6 +112,11 @@ class Selection:
     excluded: dict[str, list[int]]  # excluded frame numbers, by reason
 
 
+def ranges_of(d: Array) -> dict[str, list[float]]:
+    """Return the smallest and the largest value [mm] of each parameter by name, over d (N, 3)."""
+    return dict(zip(PARAMETERS, np.stack([d.min(axis=0), d.max(axis=0)], axis=1).tolist(), strict=True))
+
+
 def displacement(motion: Array, point: Array) -> Array:
     """Return the displacements (N, 3) [mm] of a point (3,) under motions (N, 4, 4)."""
     return motion[:, :3, :3] @ point + motion[:, :3, 3] - point
@@ -132,8 +130,7 @@ def select(source: Source, anatomy: SubjectAnatomy) -> Selection:
 def select_tracks(tracks: Tracks, anatomy: SubjectAnatomy) -> Selection:
     """Select the frames of a take that can train a model: those measured without a prior and with a small covariance.
 
-    Raises:
-        FittingError: there are too few frames, or there is no motion.
+    Raises like `select_poses`.
     """
     T = tracks.raw_T_upper_lower
     finite = np.all(np.isfinite(T), axis=(1, 2))
@@ -178,11 +175,18 @@ def _select(
 ) -> Selection:
     used = np.ones(len(frames), dtype=bool)
     excluded: dict[str, list[int]] = {}
-    reasons = {"no pose": np.any(~np.isfinite(T), axis=(1, 2)), **reasons}
+
+    def exclude(reason: str, mask: Mask) -> None:
+        out = used & mask
+        if out.any():
+            excluded[reason] = frames[out].tolist()
+            used[out] = False
+
+    exclude("no pose", np.any(~np.isfinite(T), axis=(1, 2)))
     for reason, mask in reasons.items():
-        _exclude(used, mask, reason, frames, excluded)
-    _exclude(used, _repeats(frames[:, None], used), "frame number repeated", frames, excluded)
-    _exclude(used, _repeats(T.reshape(len(T), 16), used), "same pose as an earlier frame", frames, excluded)
+        exclude(reason, mask)
+    exclude("frame number repeated", _repeats(frames[:, None], used))
+    exclude("same pose as an earlier frame", _repeats(T.reshape(len(T), 16), used))
     _check(frames[used], T[used])
     landmarks = anatomy.at_rest(anatomy.landmarks)
     data = TrainingData(
@@ -195,13 +199,6 @@ def _select(
     )
     _check_motion(data)
     return Selection(frames, T, data, used, excluded)
-
-
-def _exclude(used: Mask, mask: Mask, reason: str, frames: NDArray[np.int64], excluded: dict[str, list[int]]) -> None:
-    out = used & mask
-    if out.any():
-        excluded[reason] = frames[out].tolist()
-        used &= ~out
 
 
 def _repeats(rows: NDArray[np.int64] | Array, used: Mask) -> Mask:
@@ -270,9 +267,8 @@ class FittedForm:
 def screened(selection: Selection) -> Selection:
     """Return the selection without gross outliers: isolated tracking failures of centimetres.
 
-    A spline would interpolate such poses. A quadratic map from the incisal displacement to the rotation is too stiff to
-    do so: if it is fitted by random sample consensus (Fischler & Bolles 1981), it follows the majority of the poses,
-    and the residual of an outlier is its error.
+    A spline would interpolate them. A quadratic map from the incisal displacement to the rotation, fitted by random
+    sample consensus (Fischler & Bolles 1981), follows the majority, and the residual of an outlier is its error.
     """
     outliers = gross_outliers(selection.data)
     if not outliers.any():

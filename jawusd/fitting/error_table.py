@@ -25,11 +25,7 @@ _SMALLEST_MM = 1e-6  # smaller distances are treated as this distance
 
 
 def pose_errors(data: TrainingData, model: Array) -> dict[str, Array]:
-    """Return the errors of every frame for the motions (N, 4, 4) of a model.
-
-    Returns:
-        Distances [mm], shape (N,), by landmark; "mandible" is the distance of the vertex that is farthest off.
-    """
+    """Return distances (N,) [mm] between model (N, 4, 4) and data by landmark; "mandible" is its farthest vertex."""
     errors = {"mandible": data.metric.largest(model, data.motion)}
     for name, point in zip(LANDMARKS, data.landmarks, strict=True):
         errors[name] = np.linalg.norm(transform_point(model, point) - transform_point(data.motion, point), axis=-1)

@@ -22,11 +22,7 @@ def columns_at(face_s: Array, weights: Array, times_s: Array) -> Array:
 
 
 def offsets_between(face_s: Array, times_s: Array) -> Array:
-    """Return the candidate clock offsets [s] at which face capture and jaw take overlap by half of the shorter one.
-
-    Raises:
-        FittingError: a take is too short.
-    """
+    """Return clock offsets [s] at which two takes overlap by half of the shorter; raises FittingError if too short."""
     shorter = min(face_s[-1] - face_s[0], times_s[-1] - times_s[0]) if len(times_s) > 1 else 0.0
     if shorter < _LEAST_SECONDS:
         raise FittingError(
@@ -43,15 +39,19 @@ def refined_offset(offset_s: float, face_s: Array, weights: Array, times_s: Arra
     for offset in tried:
         seen = columns_at(face_s + offset, weights, times_s)
         rows = np.isfinite(seen).all(axis=1)
-        design = np.column_stack([np.ones(rows.sum()), seen[rows]])
-        found = np.linalg.lstsq(design, d[rows], rcond=1e-6)[0]
-        left.append(float(np.mean((design @ found - d[rows]) ** 2)))
+        left.append(float(np.mean(unexplained(seen[rows], d[rows]) ** 2)))
     best = int(np.argmin(left))
     if not 0 < best < len(tried) - 1:
         return float(tried[best])
     before, low, after = left[best - 1 : best + 2]  # refine by the vertex of the parabola through three values
     bend = before - 2 * low + after
     return float(tried[best] + (0.5 * _FINE_S * (before - after) / bend if bend > 0 else 0.0))
+
+
+def unexplained(columns: Array, d: Array) -> Array:
+    """Return what a linear function of columns (N, K) leaves of d (N, n)."""
+    design = np.column_stack([np.ones(len(columns)), columns])
+    return d - design @ np.linalg.lstsq(design, d, rcond=1e-6)[0]
 
 
 def incisal_error(rig: JawRig, found: Array, d: Array) -> float:

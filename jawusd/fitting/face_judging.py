@@ -20,19 +20,12 @@ _WIDENED = 2.0
 
 
 class JudgedFace(NamedTuple):
-    """The verdicts on a face track.
+    """The verdicts on a face track."""
 
-    Attributes:
-        frames: frame numbers, shape (F,).
-        verdicts: one entry per frame.
-        alignment_mm: rms displacement of the landmarks that the expected error of the alignment causes [mm], (F,).
-        widened_mm: distance by which both thresholds were widened for it [mm].
-    """
-
-    frames: Array
-    verdicts: Verdicts
-    alignment_mm: Array
-    widened_mm: float
+    frames: Array  # frame numbers, shape (F,)
+    verdicts: Verdicts  # one entry per frame
+    alignment_mm: Array  # rms displacement of the landmarks that the expected error of the alignment causes [mm], (F,)
+    widened_mm: float  # distance by which both thresholds were widened for it [mm]
 
 
 def judge_jaw_track(
@@ -85,11 +78,7 @@ def alignment_error_mm(rig: JawRig, T_skull_mandible: Array, alignment: Alignmen
 
 
 def save_verdicts(path: str | os.PathLike[str], judged: JudgedFace) -> None:
-    """Write the verdicts as CSV, atomically; the columns are named in the first row.
-
-    Raises:
-        OutputError: the file cannot be written.
-    """
+    """Write the verdicts as CSV, atomically; raises OutputError if that fails."""
     lines = ["frame,valid,verdict,residual_mm,margin_mm,d1,d2,d3,alignment_mm"]
     v = judged.verdicts
     for frame, ok, words, *numbers in zip(

@@ -21,12 +21,12 @@ from jawusd.fitting.anchored import fit_anchored
 from jawusd.fitting.bounds import alpha_shapes, fit_slice_hull, valid_box
 from jawusd.fitting.checks import AnatomyWarning, check_anatomy, missing_movements, shown_parameters
 from jawusd.fitting.data import (
-    PARAMETERS,
     FittedForm,
     Selection,
     Source,
     SubjectAnatomy,
     TrainingData,
+    ranges_of,
     screened,
     select,
 )
@@ -64,10 +64,9 @@ class FittingConfig:
 
     method: str = "anchored"  # a key of `FORMS`, or "paper"
     literal: bool = False  # for method "paper": whether to keep the paper's fixed grouping of components
-    # number of contiguous parts of the take that are held out in turn to measure the error on unseen poses; 0 to skip
+    #: number of contiguous parts of the take that are held out in turn to measure the error on unseen poses; 0 to skip
     holdout_folds: int = 5
-    # number of normalised median absolute deviations by which a frame's residual may exceed the median; frames beyond
-    # it count as tracking failures and are discarded
+    #: normalised median absolute deviations beyond the median residual at which frames are discarded as failures
     trim_mad: float = 4.5
     alpha: float = 0.23  # maximum triangle circumradius in the paper's alpha shapes [range-normalised units]
     starts: int = 4  # number of random initialisations of the networks of method "paper"; the best result is kept
@@ -88,7 +87,7 @@ def one_blas_thread(function: Callable[Arguments, Result]) -> Callable[Arguments
     """Limit BLAS (OpenBLAS, MKL or BLIS) to one thread while a function runs.
 
     The matrices of a fit are too small to benefit from threads; threaded sums differ in the last digits, which changes
-    a fit by micrometres. Apple's Accelerate has no such setting.
+    a fit by micrometres.
     """
 
     @wraps(function)
@@ -229,17 +228,15 @@ def _model(
     limit = max(float(np.percentile(residual_mm[trained], _TRAINED_QUANTILE)), _SMALLEST_RESIDUAL_LIMIT_MM)
     if len(unseen_mm):
         limit = max(limit, float(np.percentile(unseen_mm, _UNSEEN_QUANTILE)))
-    ends = zip(d[trained].min(axis=0).tolist(), d[trained].max(axis=0).tolist())
-    meta["ranges_mm"] = {name: [low, high] for name, (low, high) in zip(PARAMETERS, ends)}
+    meta["ranges_mm"] = ranges_of(d[trained])
     arrays = {**arrays, "residual_limit_mm": np.array(limit)}
     return JawModel(arrays, selection.frames, d, residual_mm, trained, meta)
 
 
 def with_speeds(model: JawModel, fps: float) -> JawModel:
-    """Return the model with the speeds of its training take, recorded at `fps` frames per second.
+    """Return the model with the speeds of its training frames, recorded at `fps` frames per second.
 
-    Only training frames count. The model is returned unchanged if too few of them are consecutive, or if the
-    accelerations are implausible.
+    It is returned unchanged if too few of them are consecutive, or if the accelerations are implausible.
     """
     d = np.where(model.trained[:, None], model.d, np.nan)
     gaps = np.flatnonzero(np.diff(model.frames) != 1) + 1

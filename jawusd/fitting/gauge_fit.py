@@ -1,9 +1,8 @@
 """The semantic gauge: a choice of d1, d2, d3 for which moving each slider alone stays anatomical.
 
 d1 follows the habitual opening path, the most frequent position of the incisal point at each opening. A plain lateral
-slide at closed teeth moves the incisal point forward (gothic arch) and down (tooth guidance). Habitual path, gothic
-arch and tooth guidance are learned from the captured poses and stored in the gauge; the regression of the poses does
-not depend on them.
+slide at closed teeth moves the incisal point forward (gothic arch) and down (tooth guidance). All three are learned
+from the captured poses.
 """
 
 from __future__ import annotations
@@ -45,7 +44,7 @@ class GaugeFit:
 
     gauge: Gauge
     smallest_minor: float  # smallest principal minor of the Jacobian over the box; see `smallest_minor()`
-    # factor on the ridge penalties, above 1 if a less stiff gauge was not invertible; None without a glide surface
+    #: factor on the ridge penalties, above 1 if a less stiff gauge was not invertible; None without a glide surface
     stiffness: float | None
 
 
@@ -59,10 +58,7 @@ def fit_path(u: Array, weights: Array) -> Gauge:
 
     Iteratively reweighted least squares with the weight (1 + (r/s)^2)^-2, which follows the most frequent path instead
     of the mean of all exercises; s is 1.4826 times the median absolute residual. Without opening in the data, the path
-    is a straight line downwards.
-
-    Returns:
-        The gauge of the path alone.
+    is a straight line downwards. Returns the gauge of the path alone.
     """
     opening = -u[:, 1]
     if np.subtract(*np.percentile(opening, [99, 1])) < SMALLEST_OPENING_MM:
@@ -71,6 +67,12 @@ def fit_path(u: Array, weights: Array) -> Gauge:
     basis = (opening / scale)[:, None] ** np.arange(1, _PATH_DEGREE + 1)
     coefficients = np.stack([_robust_fit(basis, u[:, axis], weights) for axis in (0, 2)])
     return path_gauge(coefficients, scale, (min(0.0, float(np.percentile(opening, 0.5))), scale))
+
+
+def sheared(u: Array, path: Gauge) -> Array:
+    """Return incisal displacements u (N, 3) [mm] as opening, and sideways and forward from the habitual path (N, 3)."""
+    gx, gz, _, _ = path.path(-u[:, 1])
+    return np.stack([-u[:, 1], u[:, 0] - gx, u[:, 2] - gz], axis=1)
 
 
 def _robust_fit(basis: Array, values: Array, weights: Array) -> Array:
@@ -88,17 +90,17 @@ def _robust_fit(basis: Array, values: Array, weights: Array) -> Array:
 def fit_gauge(u: Array, weights: Array, path: Gauge, shown: Mask) -> GaugeFit:
     """Fit gothic arch and glide surface to incisal displacements u (N, 3) [mm].
 
-    The stiffness is increased until the gauge is invertible.
+    The stiffness is increased until the gauge is invertible. If none suffices, the gauge is that of the habitual path
+    alone, which is always invertible.
 
     Args:
-        path: the gauge of the habitual path alone.
         shown: which of opening, laterotrusion and protrusion the data excite, shape (3,).
-
-    Returns:
-        The gauge; if no stiffness makes it invertible, the gauge of the path alone, which is always invertible.
     """
     for stiffness in _STIFFNESSES:
-        gauge = _fit(u, weights, path, shown, stiffness)
+        gauge = path
+        for _ in range(_ROUNDS):  # alternate between inverting the gauge for d, and fitting its parts to d
+            gauge = _with_arch(gauge, u, weights, shown, stiffness)
+            gauge = _with_drop(gauge, u, weights, shown, stiffness)
         minor = _smallest_minor_around(gauge, u)
         if minor >= SMALLEST_MINOR:
             return GaugeFit(gauge, minor, float(stiffness))
@@ -125,14 +127,6 @@ def smallest_minor(gauge: Gauge, box: Array) -> float:
     minors += [J[:, i, i] * J[:, k, k] - J[:, i, k] * J[:, k, i] for i, k in ((0, 1), (0, 2), (1, 2))]
     minors.append(np.linalg.det(J))
     return float(np.min(minors))
-
-
-def _fit(u: Array, weights: Array, gauge: Gauge, shown: Mask, stiffness: float) -> Gauge:
-    """Alternate between inverting the gauge for d and fitting the gothic arch and the tooth guidance to d."""
-    for _ in range(_ROUNDS):
-        gauge = _with_arch(gauge, u, weights, shown, stiffness)
-        gauge = _with_drop(gauge, u, weights, shown, stiffness)
-    return gauge
 
 
 def _with_arch(gauge: Gauge, u: Array, weights: Array, shown: Mask, stiffness: float) -> Gauge:

@@ -12,6 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 from scipy.ndimage import distance_transform_edt, gaussian_filter
+from scipy.spatial import cKDTree
 
 from jawusd.base.arrays import Array, Indices, Mask
 from jawusd.evaluator import JawRig
@@ -19,7 +20,7 @@ from jawusd.evaluator.curves import GlideTable
 from jawusd.evaluator.gauge import Gauge
 from jawusd.evaluator.models import AnchoredModel
 from jawusd.fitting.bounds import alpha_shapes, fit_slice_hull, valid_box
-from jawusd.fitting.data import PARAMETERS
+from jawusd.fitting.data import ranges_of
 from jawusd.fitting.gauge_fit import SMALLEST_MINOR, smallest_minor
 from jawusd.formats.model import JawModel
 from jawusd.geometry.se3 import make_transform
@@ -41,8 +42,7 @@ _GAUGE_ROOM_MM = 3.0  # margin around the captured parameters within which the g
 def follow_teeth(model: JawModel, teeth: Teeth) -> JawModel:
     """Return an anchored model whose d1 is measured from tooth contact, with bounds that end at contact.
 
-    Returns:
-        The unchanged model if it has no gauge, or if the gauge would not be invertible with any surface.
+    A model is returned unchanged if it has no gauge, or if the gauge would not be invertible with any surface.
     """
     form = JawRig(model.arrays, model.meta).model
     if not isinstance(form, AnchoredModel):
@@ -55,11 +55,8 @@ def follow_teeth(model: JawModel, teeth: Teeth) -> JawModel:
         d = _carried(form.gauge, gauge, model.d)
         if not np.isfinite(d[known]).all():
             continue
-        room = np.array([-_GAUGE_ROOM_MM, _GAUGE_ROOM_MM])
-        if (
-            smallest_minor(gauge, np.stack([d[known].min(axis=0), d[known].max(axis=0)], axis=1) + room)
-            > SMALLEST_MINOR
-        ):
+        box = np.stack([d[known].min(axis=0) - _GAUGE_ROOM_MM, d[known].max(axis=0) + _GAUGE_ROOM_MM], axis=1)
+        if smallest_minor(gauge, box) > SMALLEST_MINOR:
             return _regauged(model, form.gauge, gauge, d)
     return model
 
@@ -79,9 +76,7 @@ def _regauged(model: JawModel, old: Gauge, gauge: Gauge, d: Array) -> JawModel:
         "codes": _carried(old, gauge, model.arrays["codes"]),
         **{name: value for name, value in tolerances.items() if name in model.arrays},
     }
-    ends = zip(trained.min(axis=0).tolist(), trained.max(axis=0).tolist())
-    meta = {**model.meta, "ranges_mm": {name: [low, high] for name, (low, high) in zip(PARAMETERS, ends)}}
-    return replace(model, arrays=arrays, d=d, meta=meta)
+    return replace(model, arrays=arrays, d=d, meta={**model.meta, "ranges_mm": ranges_of(trained)})
 
 
 def _carried(old: Gauge, new: Gauge, d: Array) -> Array:
@@ -128,10 +123,8 @@ def _contact_drop(form: AnchoredModel, teeth: Teeth, d2: Array, d3: Array, captu
 def _near(points: Array, captured: Array) -> Mask:
     """Return which points (n, 2) are within about `_BEYOND_MM` of a captured point (m, 2) or of 0, by grid cells."""
     reach = int(np.ceil(_BEYOND_MM / _STEP_MM)) + 1
-    cells = {(int(a), int(b)) for a, b in np.round(np.vstack([captured, [[0.0, 0.0]]]) / _STEP_MM)}
-    around = [(a, b) for a in range(-reach, reach + 1) for b in range(-reach, reach + 1)]
-    grown = {(a + i, b + j) for a, b in cells for i, j in around}
-    return np.array([(int(a), int(b)) in grown for a, b in np.round(points / _STEP_MM)])
+    cells = cKDTree(np.round(np.vstack([captured, [[0.0, 0.0]]]) / _STEP_MM))
+    return cells.query(np.round(points / _STEP_MM), p=np.inf)[0] <= reach
 
 
 def _hull(d2: Array, d3: Array, down: Array, slopes: tuple[float, float]) -> Array:

@@ -25,7 +25,7 @@ _EVERY = 32  # stride through the hull vertices in `largest_at_least`
 class MandibleMetric:
     """Metric of pose differences: the displacement of a set of mandible points."""
 
-    # four homogeneous columns equivalent to the points, with the mean last (see `evaluator.encoding`), shape (4, 4)
+    #: four homogeneous columns equivalent to the points, with the mean last (see `evaluator.encoding`), shape (4, 4)
     vectors: Array
     extremes: Array  # vertices of the convex hull of the points [mm], shape (H, 3)
 

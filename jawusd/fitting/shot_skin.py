@@ -6,7 +6,7 @@ that are found (generalised least squares).
 
 Lips that close move the skin around them in ways that no frame with visible teeth shows. Every point therefore has an
 additional variance: the mean square of what the model leaves of its motion in the frames with hidden teeth, estimated
-in turn with d of these frames. Points that the lips move then count little; those at the chin and jaw line count most.
+in turn with d of these frames.
 """
 
 from __future__ import annotations
@@ -19,7 +19,14 @@ from jawusd.base.arrays import Array, Mask
 from jawusd.evaluator import JawRig
 from jawusd.evaluator.skin import SkinJaw
 from jawusd.fitting.skin_points import LEAST_MOVING
-from jawusd.fitting.skin_training import blocks_of, check_errors, check_motion, held_out_errors, training_rows
+from jawusd.fitting.skin_training import (
+    blocks_of,
+    check_errors,
+    check_motion,
+    head_motions,
+    held_out_errors,
+    training_rows,
+)
 
 _COMPONENTS = 12  # number of components of the motion that does not depend on d
 _FLOOR_MM = 0.05  # standard deviation of the points that is added to that in the training frames
@@ -38,18 +45,13 @@ _MEDIAN_SQUARE = 0.455  # median of the square of a standard normal variable
 
 
 class ShotJaw(NamedTuple):
-    """The jaw in all frames of a shot.
+    """The jaw in all frames of a shot."""
 
-    Attributes:
-        jaw: d with covariance; NaN where too few points are found, or where they show a jaw far wider open than in
-            the training frames. Familiar wherever it is known.
-        frames: number of frames with visible teeth, from which it was learned.
-        errors_mm: mean held-out errors at the incisal point, see `fitting.skin.fit_skin`.
-    """
-
+    #: d with covariance; NaN where too few points are found, or where they show a jaw far wider open than in the
+    #: training frames. Familiar wherever it is known
     jaw: SkinJaw
-    frames: int
-    errors_mm: dict[str, float]
+    frames: int  # number of frames with visible teeth, from which it was learned
+    errors_mm: dict[str, float]  # mean held-out errors at the incisal point, see `fitting.skin.fit_skin`
 
 
 def jaw_of_points(rig: JawRig, X: Array, d: Array, seen: Mask, sigma_mm: float) -> ShotJaw:
@@ -113,14 +115,13 @@ class PointModel:
         free = terms.shape[1]
         self._expressions = s[:_COMPONENTS, None] * Vt[:_COMPONENTS] / np.sqrt(len(X) - free)
         count = np.maximum(known.sum(axis=0) - free - _COMPONENTS, 1)
-        self._head = _head_motions(self._mean)
+        self._head = head_motions(self._mean, *_HEAD_ERROR)
         self._variance = np.square(left - low).sum(axis=0) / count + _FLOOR_MM**2
 
     def covers(self, d: Array) -> Mask:
         """Return whether d (F, 3) [mm] is known and not far wider open than in the training frames, shape (F,).
 
-        Openings are extrapolated wrongly beyond these frames, with a small covariance. Below them, the closed bite is
-        near.
+        Openings are extrapolated wrongly beyond these frames, with a small covariance.
         """
         return np.asarray((d[:, 0] - self._centre[0]) / self._size[0] <= self._widest + _BEYOND)
 
@@ -192,10 +193,3 @@ def _slopes(u: Array) -> Array:
     unit = np.eye(3)
     linear = np.broadcast_to(np.concatenate([np.zeros((1, 3)), unit]), (len(u), 4, 3))
     return np.concatenate([linear, u[:, i, None] * unit[j] + u[:, j, None] * unit[i]], axis=1)
-
-
-def _head_motions(points: Array) -> Array:
-    """Return the motions (6, 3 N) of points (N, 3) [mm] by one standard deviation of each error of the head."""
-    shifts = np.broadcast_to(np.eye(3)[:, None] * _HEAD_ERROR[0], (3, len(points), 3))
-    turns = np.cross(np.eye(3)[:, None], points - points.mean(axis=0)) * _HEAD_ERROR[1]
-    return np.concatenate([shifts, turns]).reshape(6, -1)

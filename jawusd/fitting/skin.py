@@ -19,13 +19,14 @@ from jawusd.base.errors import FittingError
 from jawusd.base.npz import TWIST_ORDER, UNITS
 from jawusd.evaluator import JawRig
 from jawusd.evaluator.skin import FAMILY, VERSION, Skin, components, skin_kernel
-from jawusd.fitting.face import COARSE_S, columns_at, offsets_between, refined_offset
+from jawusd.fitting.face import COARSE_S, columns_at, offsets_between, refined_offset, unexplained
 from jawusd.fitting.skin_training import (
     LEAST_FRAMES,
     MOST_FRAMES,
     blocks_of,
     check_errors,
     check_motion,
+    head_motions,
     held_out_errors,
     training_rows,
 )
@@ -61,15 +62,13 @@ def fit_skin(
     with closed lips and the teeth in occlusion, where d is 0.
 
     Args:
-        rig: The subject's rig.
         X: Columns in one unit, such as blendshape weights, shape (F, K); or points on the skin [mm], shape (F, N, 3),
             in any frame fixed to the head. Frames with a NaN are ignored.
         d: Jaw parameters [mm], shape (F, 3).
         seen: Frames in which d was measured, shape (F,).
         sigma_d: Standard deviation of d [mm], shape (), (3,) or (F, 3).
         head_error: For points, the additional error of head stabilisation in later frames, compared with the training
-            frames: root mean square shift [mm] and rotation about the points' centre [rad]. The predicted covariances
-                include this error.
+            frames: root mean square shift [mm] and rotation about the points' centre [rad].
         names: Names of the columns or points, stored in the file.
 
     Returns:
@@ -95,7 +94,8 @@ def fit_skin(
     arrays, held_out, variance = _process(flat, d, sigma, blocks)
     arrays["head_error"] = np.zeros((0, len(arrays["basis"])))
     if points:
-        arrays["head_error"] = _head_motions(X.mean(axis=0), head_error, arrays)
+        moved = head_motions(X.mean(axis=0), *head_error) / np.sqrt(3)
+        arrays["head_error"] = np.asarray(moved @ arrays["basis"].T / arrays["scale"])
     errors = held_out_errors(rig, held_out, d, blocks, X)
     check_errors(errors)
     strange = np.column_stack([variance, _outside(flat, blocks, float(arrays["scale"]))])
@@ -150,17 +150,11 @@ def _explained(f: Array, d: Array) -> float:
     rows = np.isfinite(f).all(axis=1)
     if rows.sum() < LEAST_FRAMES:
         return 0.0
-    design, d = np.column_stack([np.ones(rows.sum()), f[rows]]), d[rows]
-    left = d - design @ np.linalg.lstsq(design, d, rcond=1e-6)[0]
-    return float((1 - left.var(axis=0) / d.var(axis=0)).min())
+    return float((1 - unexplained(f[rows], d[rows]).var(axis=0) / d[rows].var(axis=0)).min())
 
 
 def save_skin(path: str | os.PathLike[str], skin: Skin) -> None:
-    """Write a map of format jawusd-skin/1 atomically.
-
-    Raises:
-        OutputError: the file cannot be written.
-    """
+    """Write a map of format jawusd-skin/1 atomically; raises OutputError if that fails."""
     meta = {"units": UNITS, "twist_order": TWIST_ORDER, **skin.meta, "format": f"{FAMILY}/{VERSION}"}
     write_npz_atomic(path, {**skin.arrays, "meta": np.array(json.dumps(meta, sort_keys=True))})
 
@@ -168,7 +162,7 @@ def save_skin(path: str | os.PathLike[str], skin: Skin) -> None:
 def _process(flat: Array, d: Array, sigma: Array, blocks: list[Indices]) -> tuple[dict[str, Array], Array, Array]:
     """Return the arrays of the Gaussian process, and predictions (M, 3) and variances (M,) for held-out blocks.
 
-    The kernel maximises the likelihood of held-out blocks; a coordinate search varies the logarithms of its parameters.
+    A coordinate search varies the logarithms of the kernel's parameters to maximise the likelihood of held-out blocks.
     """
     mean = flat.mean(axis=0)
     basis = np.linalg.svd(flat - mean, full_matrices=False)[2][:_COMPONENTS]
@@ -231,12 +225,3 @@ def _outside(flat: Array, blocks: list[Indices], scale: float) -> Array:
         basis = np.linalg.svd(others - mean, full_matrices=False)[2][: _inside(flat)]
         found[b] = components(flat[b], mean, basis, scale)[1]
     return found
-
-
-def _head_motions(points: Array, head_error: tuple[float, float], arrays: dict[str, Array]) -> Array:
-    """Return how features change if mean points (N, 3) shift or rotate by one sigma per axis, shape (6, C)."""
-    arms = points - points.mean(axis=0)
-    shifts = np.repeat(np.eye(3)[:, None], len(points), axis=1) * head_error[0]
-    turns = np.cross(np.eye(3)[:, None], arms) * head_error[1]
-    moved = np.concatenate([shifts, turns]).reshape(6, -1) / np.sqrt(3)
-    return np.asarray(moved @ arrays["basis"].T / arrays["scale"])

@@ -22,11 +22,7 @@ _NAMES = ("opening", "laterotrusion", "protrusion")
 
 
 def training_rows(usable: Mask) -> Indices:
-    """Return the training frames, evenly spaced among the usable ones.
-
-    Raises:
-        FittingError: there are too few.
-    """
+    """Return the training frames, evenly spaced among the usable ones; raises FittingError if these are too few."""
     rows = np.flatnonzero(usable)
     if len(rows) < LEAST_FRAMES:
         raise FittingError(
@@ -43,12 +39,7 @@ def blocks_of(count: int) -> list[Indices]:
 
 
 def check_motion(flat: Array, d: Array, sigma: Array) -> None:
-    """Check that the training frames vary enough to learn every parameter.
-
-    Args:
-        flat: columns of the face (M, K).
-        d: jaw parameters (M, 3) [mm].
-        sigma: their standard deviations.
+    """Check that columns of the face (M, K) and d (M, 3) [mm] vary enough to learn every parameter.
 
     Raises:
         FittingError: a parameter or the face hardly moves, or a standard deviation is not positive.
@@ -71,10 +62,8 @@ def held_out_errors(rig: JawRig, held_out: Array, d: Array, blocks: list[Indices
     """Return the mean errors at the incisal point [mm] of held-out predictions and of baselines; see `fit_skin`.
 
     Args:
-        rig: the subject's rig.
         held_out: d (M, 3) predicted for each block from the others [mm].
         d: measured d (M, 3) [mm].
-        blocks: frames that were held out in turn.
         X: points (M, N, 3) [mm] or columns (M, K) of these frames.
     """
     guesses = {"skin": held_out, "carried": _carried(d, blocks), "mean": np.broadcast_to(d.mean(axis=0), d.shape)}
@@ -84,11 +73,7 @@ def held_out_errors(rig: JawRig, held_out: Array, d: Array, blocks: list[Indices
 
 
 def check_errors(errors: dict[str, float]) -> None:
-    """Check that held-out errors are at most 65 % of those of the baselines given.
-
-    Raises:
-        FittingError: they are larger.
-    """
+    """Raise FittingError if held-out errors exceed 65 % of those of the baselines given."""
     called = {"carried": "holding the last d", "mean": "the mean d", "chin": "a chin rigid with the bone"}
     for name, words in called.items():
         if name in errors and errors["skin"] > _MOST_SHARE * errors[name]:
@@ -99,6 +84,13 @@ def check_errors(errors: dict[str, float]) -> None:
                 hint="Check that face and jaw data show the same performance on one clock, and that the head is "
                 "stabilised. Add points or expressions; if a rigid chin is as good, use inverse kinematics (`rig.ik`).",
             )
+
+
+def head_motions(points: Array, shift_mm: float, turn_rad: float) -> Array:
+    """Return the motions (6, 3 N) [mm] of points (N, 3) by shifts along and turns about each axis, at their centre."""
+    shifts = np.broadcast_to(np.eye(3)[:, None] * shift_mm, (3, len(points), 3))
+    turns = np.cross(np.eye(3)[:, None], points - points.mean(axis=0)) * turn_rad
+    return np.concatenate([shifts, turns]).reshape(6, -1)
 
 
 def _carried(d: Array, blocks: list[Indices]) -> Array:
