@@ -22,7 +22,7 @@ PAGES = {
         ["jawusd.library.personal", "jawusd.library.timing"],
     ),
     "pipeline": (
-        "The stages connected, as the commands call them. Heavy packages are loaded by the functions that need them.",
+        "The stages connected, as the commands call them. Heavy packages are loaded when they are needed.",
         [f"jawusd.pipeline.{name}" for name in STAGES],
     ),
     "fitting": (

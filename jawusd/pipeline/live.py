@@ -7,7 +7,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -17,6 +16,7 @@ from jawusd.evaluator import JawRig
 from jawusd.formats.capture import Capture
 from jawusd.formats.performance import SolveState
 from jawusd.media import live_source
+from jawusd.media.live_source import LiveSource
 from jawusd.pipeline.calibrate import sync_cameras
 from jawusd.pipeline.cameras import load_cameras
 from jawusd.pipeline.live_jaw import LiveFrame, LiveJaw, LiveSkin
@@ -27,12 +27,10 @@ from jawusd.pipeline.state import no_progress
 from jawusd.pipeline.subject import load_labelled, registered_meshes
 from jawusd.pipeline.track_videos import Cutter
 from jawusd.pipeline.workspace import open_capture
-
-if TYPE_CHECKING:
-    from jawusd.media.live_source import LiveSource
-    from jawusd.segmentation.picture import Pictures
-    from jawusd.tracking.performance.coordinates import Pose
-
+from jawusd.segmentation.picture import Pictures
+from jawusd.tracking.contour.scan import teeth_centre
+from jawusd.tracking.performance.coordinates import Pose
+from jawusd.tracking.region.live import LiveTake
 
 _PATIENCE_S = 2.0  # time without visible teeth [s] after which a new search begins
 _WAIT_S = 0.25
@@ -64,10 +62,8 @@ def live(
         sources: device, stream address or file of each camera, by camera name.
         prim: path of the rig's prim, if a stage has several.
         fixed_head: the cameras are head-mounted.
-        jobs: number of threads.
         seconds: duration after which tracking stops [s]; None: when the sources end.
         silence_s: maximum time without an image from a device or stream [s].
-        allow_outside: allow paths in the capture that point outside its folder.
         skin: facial skin, which determines d in frames with hidden teeth; see `LiveSkin`.
 
     Raises:
@@ -142,12 +138,8 @@ class OscSender:
 def next_instant(times_s: Sequence[Sequence[float]], after_s: float) -> float | None:
     """Return the time of the next frame to process; None if a source has no image of that frame yet.
 
-    The oldest frame within `_MOST_BEHIND_S` of the newest one is chosen. A search takes as long as several frames;
-    tracking is faster than real time and catches up afterwards.
-
-    Args:
-        times_s: increasing times of the buffered images of each source.
-        after_s: time [s]; only later frames are returned.
+    The oldest frame after `after_s` and within `_MOST_BEHIND_S` of the newest one is chosen, since tracking catches up
+    after a search. The times of the buffered images of each source increase.
     """
     if not all(len(kept) for kept in times_s):
         return None
@@ -158,20 +150,15 @@ def next_instant(times_s: Sequence[Sequence[float]], after_s: float) -> float | 
 
 def _with_sources(capture: Capture, sources: Mapping[str, str]) -> tuple[Capture, dict[str, str]]:
     """Return the capture restricted to cameras with a source, and the sources; source files replace its videos."""
-    names = [camera.name for camera in capture.cameras]
+    names, path = [camera.name for camera in capture.cameras], capture.folder / "capture.toml"
     if unknown := sorted(set(sources) - set(names)):
-        raise CaptureError(
-            f"sources are given for unknown cameras {', '.join(unknown)}; the capture has {', '.join(names)}.",
-            path=capture.folder / "capture.toml",
-        )
+        message = f"sources are given for unknown cameras {', '.join(unknown)}; the capture has {', '.join(names)}."
+        raise CaptureError(message, path=path)
     videos = {camera.name: str(camera.video) for camera in capture.cameras if camera.video is not None}
     where = dict(sources) or videos
     if not where:
-        raise CaptureError(
-            "no camera has a video, and no source is given.",
-            path=capture.folder / "capture.toml",
-            hint="Give devices or streams with --source CAMERA=/dev/video0.",
-        )
+        hint = "Give devices or streams with --source CAMERA=/dev/video0."
+        raise CaptureError("no camera has a video, and no source is given.", path=path, hint=hint)
     files = {name: Path(one) for name, one in where.items() if Path(one).is_file()}
     cameras = tuple(
         camera.model_copy(update={"video": files.get(camera.name, camera.video)})
@@ -193,9 +180,6 @@ class _Follower:
         pool: Executor,
         skin: SkinOptions | None,
     ) -> None:
-        from jawusd.media.live_source import LiveSource
-        from jawusd.tracking.region.live import LiveTake
-
         self._capture, where = _with_sources(capture, sources)
         self._jaw, self._period_s = jaw, 1.0 / capture.fps
         self._files = all(Path(one).is_file() for one in where.values())
@@ -265,7 +249,7 @@ class _Follower:
         return jaw
 
     def _without_teeth(self, at: float, passed_s: float) -> LiveJaw | None:
-        """Return the jaw estimated from skin alone, in a frame in which the teeth are searched for; None if unknown."""
+        """Return the jaw by skin alone, in a frame in which the teeth are searched for; None if unknown."""
         if self._skin is None:
             return None
         unknown = LiveJaw(self._last_d, _UNKNOWN_MM**2 * np.eye(3), SolveState.CARRIED)
@@ -287,14 +271,9 @@ class _Follower:
         )
 
     def _begin_in_files(self) -> int:
-        """Search for the teeth before the files are played; return the frame at which playback starts.
-
-        Raises:
-            TrackingError: the teeth were not found.
-        """
-        shot = VideoShot(
-            self._capture, self._cameras, self._offsets, self._teeth, self._jaw, VideoOptions(), no_progress
-        )
+        """Search for the teeth before the files are played; return the frame at which playback starts."""
+        cameras, options = self._cameras, VideoOptions()
+        shot = VideoShot(self._capture, cameras, self._offsets, self._teeth, self._jaw, options, no_progress)
         begin = shot.begin()
         after = range(begin.frame, min(begin.frame + _BEFORE, shot.footage.range()[1]))
         for frame, pictures in shot.footage.walk(after):
@@ -306,8 +285,6 @@ class _Follower:
 
     def _learn(self, pictures: Pictures, near: Pose) -> None:
         """Learn the colours of the teeth from images, given an approximate pose; start tracking if the teeth fit."""
-        from jawusd.tracking.contour.scan import teeth_centre
-
         centre = teeth_centre(self._teeth.scans, self._take.coordinates.arches(near))
         cutter = Cutter(self._cameras, self._teeth.scans, centre, self._pool)
         if self._take.begin(cutter.cut(pictures), near) >= least_fit(len(self._cameras)):
@@ -340,5 +317,4 @@ class _Follower:
     def _pictures(self, at: float) -> Pictures:
         """Return the image of each source at a time; None for sources without an image near that time."""
         found = {name: source.at(at) for name, source in self._sources.items()}
-        near = self._period_s
-        return {n: None if p is None or abs(p.time_s - at) > near else p.rgb for n, p in found.items()}
+        return {n: p.rgb if p is not None and abs(p.time_s - at) <= self._period_s else None for n, p in found.items()}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Generic, Protocol, TypeVar
+from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 
@@ -12,12 +12,10 @@ from jawusd.base.arrays import Array
 from jawusd.base.errors import TrackingError
 from jawusd.formats.capture import Bootstrap
 from jawusd.geometry import Camera, se3_inverse
+from jawusd.media.masks import FrameMasks
 from jawusd.pipeline.state import Progress
-
-if TYPE_CHECKING:
-    from jawusd.media.masks import FrameMasks
-    from jawusd.segmentation.picture import ColourFootage, Pictures
-    from jawusd.segmentation.rows import Rows
+from jawusd.segmentation.picture import ColourFootage, Pictures
+from jawusd.segmentation.rows import Rows, tooth_rows
 
 # Number of frames per part of the take, maximum stride of the search [frames], and minimum number of frames searched in
 # a long part.
@@ -88,32 +86,22 @@ class _Candidate:
 
 @dataclass(frozen=True, eq=False)
 class PictureSearch(Generic[T]):
-    """A search for the teeth in footage without masks, everywhere or at picks.
+    """A search for the teeth in footage without masks, everywhere or at picks."""
 
-    Attributes:
-        footage: the images of the cameras that have a video.
-        cameras: the calibrated cameras that have a video, by name.
-        offsets: frame offset by camera.
-        near: estimates the pose in a frame from rough masks or picks.
-        judged: function that refines a pose in a frame; returns the pose and the fraction of the visible contour that
-            fits, 0 .. 1.
-    """
-
-    footage: ColourFootage
-    cameras: Mapping[str, Camera]
-    offsets: Mapping[str, int]
-    near: StartInFrame[T]
+    footage: ColourFootage  # the images of the cameras that have a video
+    cameras: Mapping[str, Camera]  # the calibrated cameras that have a video, by name
+    offsets: Mapping[str, int]  # frame offset by camera
+    near: StartInFrame[T]  # estimates the pose in a frame from rough masks or picks
+    #: refines a pose in a frame; returns the pose and the fraction (0 .. 1) of the visible contour that fits
     judged: Callable[[int, T], tuple[T, float]]
 
     def run(self, frames: range, progress: Progress, up_world: Array | None = None) -> Start[T]:
         """Return the first start that fits clearly, or else the best one among some frames.
 
-        `up_world` is the up direction of the head in the world, shape (3,), if known from other frames. If it is given,
-        one camera orientation is tried and, with several cameras, the first start that fits is returned, because it
-        can be compared with those frames. Otherwise, four orientations are tried. If no start of several cameras fits,
-        starts of single cameras are tried in the frame with the best one.
-
-        Progress is reported for frames searched and for starts tried.
+        Without `up_world`, the up direction of the head in the world (3,), four camera orientations are tried. If it is
+        known from other frames, only one is tried and, with several cameras, the first start that fits is returned,
+        because it can be compared with those frames. If no start of several cameras fits, starts of single cameras are
+        tried in the frame with the best one.
 
         Raises:
             TrackingError: no start fits.
@@ -130,8 +118,8 @@ class PictureSearch(Generic[T]):
         for part in (frames[k : k + _PART] for k in range(0, len(frames), _PART)):
             seen += len(part)
             for turns in hypotheses:
-                candidates = self._candidates(part, turns, progress)
-                candidates = sorted(candidates, key=lambda candidate: candidate.rank)[:_TRIED]
+                apart = self._candidates(part, turns, progress)
+                candidates = sorted(apart, key=lambda candidate: candidate.rank)[:_TRIED]
                 for done, candidate in enumerate(candidates, start=1):
                     tried.append(candidate.frame)
                     found = self._at(candidate)
@@ -175,11 +163,7 @@ class PictureSearch(Generic[T]):
                 yield self._at(replace(candidate, rows={name: rows}))
 
     def picked(self, picks: Bootstrap, frames: range, least_fit: float) -> Start[T]:
-        """Return a start of tracking from picks.
-
-        Args:
-            frames: range to be tracked.
-            least_fit: minimum fraction of the visible contour that fits for the start to be accepted.
+        """Return a start from picks in the frames to be tracked; at least `least_fit` of the visible contour must fit.
 
         Raises:
             TrackingError: the frame is outside the range, or the picks are inconsistent or do not match the images.
@@ -206,8 +190,7 @@ def least_fit(cameras: int) -> float:
 def upright_turns(cameras: Mapping[str, Camera], up_world: Array) -> dict[str, int]:
     """Return the number of counter-clockwise quarter turns that make each camera's image upright.
 
-    `up_world` is the up direction of the head in the world, shape (3,). Cameras that look along this
-    direction are left out.
+    Cameras that look along `up_world`, the up direction of the head in the world (3,), are left out.
     """
     turns = {}
     for name, camera in cameras.items():
@@ -220,9 +203,8 @@ def upright_turns(cameras: Mapping[str, Camera], up_world: Array) -> dict[str, i
 def orientations(cameras: Mapping[str, Camera]) -> list[dict[str, int]]:
     """Return four hypotheses of how the cameras are turned about their optical axes, as in `upright_turns`.
 
-    A camera may lie on its side or hang upside down. The calibration gives the orientations of the cameras relative to
-    one another, so that only the turn of the first camera is unknown. The hypothesis with the most upright cameras
-    comes first.
+    By the calibration, only the turn of the first camera is unknown. The hypothesis with the most upright cameras comes
+    first.
     """
     T_world_first = se3_inverse(next(iter(cameras.values())).T_cam_world)
     ups = [np.array([np.sin(angle), -np.cos(angle), 0.0]) for angle in np.pi / 2 * np.array([0, 1, 3, 2])]
@@ -231,14 +213,7 @@ def orientations(cameras: Mapping[str, Camera]) -> list[dict[str, int]]:
 
 
 def arches_apart(pictures: Pictures, turns: Mapping[str, int]) -> dict[str, Rows]:
-    """Return the arches in the images in which they are visibly apart, by camera name.
-
-    Args:
-        pictures: image of each camera by name; None if it has none.
-        turns: counter-clockwise quarter turns that make the images upright, by camera name.
-    """
-    from jawusd.segmentation.rows import tooth_rows
-
+    """Return the arches in the images in which they are visibly apart, by camera; `turns` as in `upright_turns`."""
     images = {name: image for name, image in pictures.items() if image is not None and name in turns}
     rows = {name: tooth_rows(np.asarray(image), turns[name]) for name, image in images.items()}
     return {name: row for name, row in rows.items() if row is not None and row.bridged <= _MOST_BRIDGED}
@@ -259,8 +234,6 @@ def _describe_failure(tried: Sequence[int], best: Start[T] | None, least: float,
 
 def rough_masks(rows: Mapping[str, Rows], offsets: Mapping[str, int], frame: int) -> list[FrameMasks]:
     """Return the arches that were detected in the images of a frame as masks, by camera."""
-    from jawusd.media.masks import FrameMasks
-
     return [FrameMasks(name, frame - offsets[name], found.masks) for name, found in rows.items()]
 
 

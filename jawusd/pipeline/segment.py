@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import cast
 
 import numpy as np
 
@@ -25,12 +25,16 @@ from jawusd.pipeline.state import Progress, hash_files, hash_value
 from jawusd.pipeline.subject import load_meshes, subject_of_capture
 from jawusd.pipeline.track_videos import Follower
 from jawusd.pipeline.workspace import input_hashes
-
-if TYPE_CHECKING:
-    from jawusd.segmentation.camera import CameraSegmenter, Segment
-    from jawusd.segmentation.picture import Pictures
-    from jawusd.tracking.contour.frame_record import FrameRecord, FrameSummary
-    from jawusd.tracking.contour.views import View
+from jawusd.segmentation.camera import CameraSegmenter, Segment
+from jawusd.segmentation.colours import ColourStates, SegmentationConfig, state_files
+from jawusd.segmentation.files import KeyMasks, mask_path, write_mask
+from jawusd.segmentation.learn import learn_numbers
+from jawusd.segmentation.picture import Pictures
+from jawusd.tracking.contour.frame_record import FrameRecord, FrameSummary
+from jawusd.tracking.contour.quality import view_residual_px
+from jawusd.tracking.contour.views import View
+from jawusd.tracking.region.picture_start import ArchStart
+from jawusd.tracking.sequence.guided import GuidedTracker
 
 ARCHES = ("upper", "lower")
 
@@ -48,15 +52,9 @@ class SegmentOptions:
 def segment_teeth(
     capture: Capture, offsets: dict[str, int], folder: Path, options: SegmentOptions, progress: Progress
 ) -> dict[int, FrameEntry]:
-    """Write masks of both arches for every frame and camera of a capture.
+    """Write masks of both arches for every frame and camera of a capture, whose own masks are ignored.
 
-    Args:
-        capture: the capture; its videos, calibration, scans, picks and frame range are used, its masks are ignored.
-        offsets: frame offset by camera.
-        folder: output folder of masks CAMERA/upper/000123.png, numbered by the camera's own frames.
-
-    Returns:
-        The record of all frames.
+    The files are CAMERA/upper/000123.png, numbered by the camera's own frames. Returns the record of all frames.
 
     Raises:
         CaptureError: fewer than two cameras have a video, or one cannot be decoded.
@@ -87,10 +85,6 @@ class _Segmentation:
         progress: Progress,
         pool: Executor,
     ) -> None:
-        from jawusd.segmentation.colours import SegmentationConfig
-        from jawusd.segmentation.files import KeyMasks
-        from jawusd.tracking.sequence.guided import GuidedTracker
-
         self._capture, self._folder, self._progress, self._pool = capture, folder, progress, pool
         self._cameras, self._footage = open_colour_footage(capture, offsets, "segmentation")
         meshes = load_meshes(capture)
@@ -118,8 +112,6 @@ class _Segmentation:
 
     def run(self) -> dict[int, FrameEntry]:
         """Segment all unfinished frames, and repeat all of them after learning from drawn masks."""
-        from jawusd.segmentation.colours import state_files
-
         start, poses = self._find_start()
         if not self._guide:
             self._follow(start, poses)
@@ -131,7 +123,7 @@ class _Segmentation:
             with self._opened(start, self._footage.at(start)) as shown:
                 record = self._tracker.begin(start, self._guide[start].poses)
                 self._write(start, record, shown.segments)
-        self._advance("segment", len(self._journal.entries))
+        self._progress("segment", len(self._journal.entries), self._stop - self._first)
         for step, end in ((1, self._stop), (-1, self._first - 1)):
             self._track_to(start, end, step)
         if keyed := self._keyed():
@@ -146,11 +138,7 @@ class _Segmentation:
         save_guide(self._folder, self._guide_inputs, self._guide)
 
     def _find_start(self) -> tuple[int, Array]:
-        """Return the start frame and its poses, shape (2, 4, 4), from picks or, without picks, from a search.
-
-        Raises:
-            TrackingError: the picks are inconsistent, or the teeth were not found.
-        """
+        """Return the start frame and its poses, shape (2, 4, 4), from picks or, without picks, from a search."""
         picks = self._capture.bootstrap
         frames = range(self._first, self._stop)
         if picks is not None:
@@ -168,16 +156,10 @@ class _Segmentation:
 
     def _follower(self) -> tuple[Follower, PictureSearch[Array]]:
         """Return a tracker by colours, and a search for the teeth that uses it to refine poses."""
-        from jawusd.tracking.region.picture_start import ArchStart
-
         follower = Follower(self._footage, self._cameras, self._tracker.scans, self._subject, self._pool)
         upper, lower = self._tracker.scans
         rows = ArchStart(self._meshes, (upper, lower), self._capture.anatomy.T_anatomical_skull, self._pool.map)
-        footage = self._footage, self._cameras, self._offsets
-        return follower, PictureSearch(*footage, rows, follower.start_at)
-
-    def _advance(self, stage_name: str, done: int) -> None:
-        self._progress(stage_name, done, self._stop - self._first)
+        return follower, PictureSearch(self._footage, self._cameras, self._offsets, rows, follower.start_at)
 
     @contextlib.contextmanager
     def _opened(self, frame: int, pictures: Pictures) -> Iterator[_OpenFrame]:
@@ -189,16 +171,12 @@ class _Segmentation:
             del self._open[frame]
 
     def _new_segmenters(self, poses: Array) -> None:
-        from jawusd.segmentation.camera import CameraSegmenter
-
         self._segmenters = {
             name: CameraSegmenter(camera, self._meshes, poses, self._config) for name, camera in self._cameras.items()
         }
 
     def _track_to(self, start: int, end: int, step: int) -> None:
         """Track from the start frame to one end of the take, skipping finished frames."""
-        from jawusd.segmentation.colours import ColourStates
-
         done = start
         while done + step != end and done + step in self._journal.entries:
             done += step
@@ -227,12 +205,10 @@ class _Segmentation:
                     model.restore(*known[name])
             state.save(frame, step)
             self._write(frame, record, shown.segments)
-            self._advance("segment", len(self._journal.entries))
+            self._progress("segment", len(self._journal.entries), self._stop - self._first)
 
     def _past(self, frame: int) -> FrameSummary:
         """Return the tracker's summary of a finished frame."""
-        from jawusd.tracking.contour.frame_record import FrameSummary
-
         poses, status = self._journal.known(frame)
         track = dict(self._journal.entries[frame]["track"])
         used = np.array(track.pop("used"), bool)
@@ -250,8 +226,6 @@ class _Segmentation:
 
     def _learn_and_repeat(self, keyed: Sequence[int]) -> None:
         """Learn colours and parameters from drawn masks, then segment all frames again at the known poses."""
-        from jawusd.segmentation.learn import learn_numbers
-
         self._new_segmenters(self._journal.known(self._start)[0])
         examples = []
         for frame in keyed:
@@ -272,12 +246,10 @@ class _Segmentation:
             with self._opened(frame, pictures) as shown:
                 record = self._tracker.judge(frame, *self._journal.known(frame))
             self._write(frame, record, shown.segments, again=True)
-            self._advance("segment again", frame + 1 - self._first)
+            self._progress("segment again", frame + 1 - self._first, self._stop - self._first)
 
     def _see(self, frame: int, poses: Array, turn: int) -> list[View]:
         """Segment the images of a frame, and return the masks as views for the tracker."""
-        from jawusd.tracking.contour.views import View
-
         shown = self._open[frame]
 
         def one(name: str) -> Segment | None:
@@ -299,9 +271,6 @@ class _Segmentation:
 
     def _write(self, frame: int, record: FrameRecord, segments: dict[str, Segment | None], again: bool = False) -> None:
         """Write the masks and the record of a frame."""
-        from jawusd.tracking.contour.frame_record import FrameSummary
-        from jawusd.tracking.contour.quality import view_residual_px
-
         residual = view_residual_px(record.solution)
         cameras: dict[str, CameraEntry] = {}
         for k, (name, found) in enumerate(segments.items()):
@@ -330,8 +299,6 @@ class _Segmentation:
         self._journal.add(frame, entry)
 
     def _write_masks(self, name: str, found: Segment, own: int) -> None:
-        from jawusd.segmentation.files import mask_path, write_mask
-
         masks = self._segmenters[name].recorded(found)
         for arch, made, key in zip(ARCHES, masks, self._keys.of(name, own), strict=True):
             mask = np.where(key.mask > 127, np.uint8(255), np.uint8(0)) if key is not None and key.finished else made

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -19,9 +18,8 @@ from jawusd.formats.tracks import Tracks
 from jawusd.geometry import relative_pose, se3_inverse, transform_points
 from jawusd.pipeline.segment_record import auto_masks_folder
 from jawusd.pipeline.subject import registration_of
-
-if TYPE_CHECKING:
-    from jawusd.tracking.region.tracker import RegionPose
+from jawusd.tracking.region.tracker import RegionPose
+from jawusd.tracking.sequence.smoothing import combine
 
 # Distance [mm] between the jaw poses from masks and from colours above which one of them must be wrong; correct poses
 # of three takes differed by at most 0.9 mm. Fractions of wrong or lost frames above which a take is reported as partly
@@ -31,20 +29,12 @@ GUIDE, _FAMILY = "guide.npz", "jawusd-guide"
 
 
 def save_guide(folder: Path, inputs: str, guide: Mapping[int, RegionPose]) -> None:
-    """Write poses tracked by colour, with the hash of the inputs used.
-
-    Raises:
-        OutputError: the file cannot be written.
-    """
+    """Write poses tracked by colour, with the hash of the inputs used."""
     frames = sorted(guide)
     meta = {"format": f"{_FAMILY}/1", "units": UNITS, "twist_order": TWIST_ORDER, "inputs": inputs}
-    arrays = {
-        "meta": np.array(json.dumps(meta)),
-        "frames": np.array(frames),
-        "poses": np.stack([guide[frame].poses for frame in frames]),
-        "found": np.stack([guide[frame].found for frame in frames]),
-        "covariance": np.stack([guide[frame].covariance for frame in frames]),
-    }
+    arrays = {"meta": np.array(json.dumps(meta)), "frames": np.array(frames)}
+    for name in ("poses", "found", "covariance"):
+        arrays[name] = np.stack([getattr(guide[frame], name) for frame in frames])
     write_npz_atomic(folder / GUIDE, arrays, packed=False)
 
 
@@ -58,13 +48,7 @@ def known_guide(folder: Path, inputs: str) -> dict[int, RegionPose]:
 
 
 def _read(path: Path) -> tuple[dict[int, RegionPose], str]:
-    """Return the stored poses and the hash of their inputs; both are empty if the file is missing.
-
-    Raises:
-        FormatError: the file is corrupt.
-    """
-    from jawusd.tracking.region.tracker import RegionPose
-
+    """Return the stored poses and the hash of their inputs; both are empty if the file is missing."""
     if not path.exists():
         return {}, ""
     arrays, meta = read_npz(path, _FAMILY, 1)
@@ -79,10 +63,8 @@ def _read(path: Path) -> tuple[dict[int, RegionPose], str]:
 def combine_guide(capture: Capture, tracks: Tracks, landmarks: Array) -> tuple[Tracks, list[Finding]]:
     """Combine tracks from automatic masks with the poses tracked by colour; also return findings on their agreement.
 
-    Tracks from hand-drawn or imported masks are returned unchanged. Masks segmented around a wrong pose confirm that
-    pose; colour edges have independent errors, so the wrong pose shows as a disagreement. Findings: "footage_doubtful"
-    [%] for frames that are lost or in which the poses differ by more than a millimetre, "footage_unchecked" if there
-    are no poses tracked by colour.
+    Tracks from other masks are returned unchanged. Masks segmented around a wrong pose confirm that pose; colour edges
+    have independent errors, so the wrong pose shows as a disagreement.
 
     Args:
         landmarks: lower teeth, then condyles, mandible coordinates [mm], shape (5, 3).
@@ -90,8 +72,6 @@ def combine_guide(capture: Capture, tracks: Tracks, landmarks: Array) -> tuple[T
     Raises:
         FormatError: the file of the poses is corrupt.
     """
-    from jawusd.tracking.sequence.smoothing import combine
-
     folder = auto_masks_folder(capture)
     if folder is None:
         return tracks, []

@@ -1,8 +1,4 @@
-"""Records of a segmentation: a journal with one line per finished frame, and a summary with confidences.
-
-An interrupted segmentation is resumed from the journal. The summary has a confidence per frame and camera, and lists
-the masks to inspect, worst first.
-"""
+"""Records of a segmentation: a journal with one line per finished frame, for resuming, and a summary of confidences."""
 
 from __future__ import annotations
 
@@ -18,7 +14,7 @@ from numpy.typing import NDArray
 from jawusd.base.arrays import Array
 from jawusd.base.errors import FormatError, OutputError, explain_missing_packages
 from jawusd.formats.atomic import write_text_atomic
-from jawusd.formats.capture import Capture
+from jawusd.formats.capture import CameraSource, Capture
 from jawusd.formats.capture_parts import Masks
 from jawusd.formats.text import read_text
 from jawusd.formats.tracks import LOST
@@ -29,10 +25,9 @@ FORMAT = "jawusd-segment/1"
 _MAX_LEARNED_BYTES = 1 << 20
 # Confidence below which masks need inspection.
 _LOW_CONFIDENCE = 0.5
-# Symptoms of a bad mask, with 1 if larger values are worse and -1 if smaller ones are. Each is compared with its median
-# over the take.
-_SYMPTOMS = {"contrast": -1.0, "unexpected": 1.0, "residual_px": 1.0, "uncovered": 1.0}
-_LEAST_SPREAD = {"contrast": 0.03, "unexpected": 0.01, "residual_px": 0.05, "uncovered": 0.01}
+# Symptoms of a bad mask, with 1 if larger values are worse and -1 if smaller ones are, and the least spread of their
+# values. Each is compared with its median over the take.
+_SYMPTOMS = {"contrast": (-1, 0.03), "unexpected": (1, 0.01), "residual_px": (1, 0.05), "uncovered": (1, 0.01)}
 _USUAL_OFF = 3.0  # deviation, in robust standard deviations, at which a single symptom halves the confidence
 # Likely error of a mask's outline [px of the working image] on an image edge, away from edges, and between the arches.
 # Integrated along the outline and divided by the mask's area, it gives the fraction of the mask that may be wrong. This
@@ -118,11 +113,7 @@ class Journal:
     """The record of finished frames, kept in memory and in a JSON Lines file."""
 
     def __init__(self, folder: Path, inputs: str, resume: bool) -> None:
-        """Open the record, empty or with the frames already finished from the same inputs.
-
-        Args:
-            inputs: hash of all inputs.
-            resume: keep recorded frames if their inputs are the same.
+        """Open the record, empty or, to resume, with the frames already finished from inputs with the same hash.
 
         Raises:
             OutputError: the folder cannot be written, or the file cannot be read.
@@ -136,11 +127,7 @@ class Journal:
         self.drop(())
 
     def add(self, frame: int, entry: FrameEntry) -> None:
-        """Record a finished frame.
-
-        Raises:
-            OutputError: the file cannot be written.
-        """
+        """Record a finished frame; raises OutputError if the file cannot be written."""
         line = _line(frame, entry)
         self.entries[frame] = json.loads(line)["entry"]
         try:
@@ -150,11 +137,7 @@ class Journal:
             raise OutputError(f"cannot be written: {error.strerror}.", path=self._path) from error
 
     def drop(self, frames: Iterable[int]) -> None:
-        """Remove frames.
-
-        Raises:
-            OutputError: the file cannot be written.
-        """
+        """Remove frames."""
         for frame in frames:
             del self.entries[frame]
         kept = [self._head, *(_line(frame, entry) for frame, entry in self.entries.items())]
@@ -204,8 +187,8 @@ def summarise(entries: Mapping[int, FrameEntry]) -> list[MaskConfidence]:
     everywhere = np.full(len(keys), "")
     pairs = cast("list[Mapping[str, Pair]]", found)
     parts = [
-        _off(sign * np.array([entry[name] for entry in pairs], np.float64), cameras, _LEAST_SPREAD[name])
-        for name, sign in _SYMPTOMS.items()
+        _off(sign * np.array([entry[name] for entry in pairs], np.float64), cameras, least_spread)
+        for name, (sign, least_spread) in _SYMPTOMS.items()
     ]
     parts.append(_off(_outline_doubt(found), everywhere, _OUTLINE_SPREAD) * (_USUAL_OFF / _OUTLINE_OFF))
     off = np.stack(parts, axis=-1)  # shape (N, 2, number of symptoms)
@@ -250,15 +233,11 @@ def _off(values: Array, groups: NDArray[np.str_], least_spread: float) -> Array:
 
 @explain_missing_packages()
 def write_summary(capture: Capture, entries: Mapping[int, FrameEntry], folder: Path) -> SegmentSummary:
-    """Write segment.json, and thumbnails of the worst masks if any need inspection.
-
-    Args:
-        folder: folder of the masks.
+    """Write segment.json, and thumbnails of the worst masks if any need inspection, to the folder of the masks.
 
     Raises:
         CaptureError: an image or mask cannot be read.
         FormatError: the file of learned parameters is corrupt.
-        OutputError: a file cannot be written.
     """
     rows = summarise(entries)
     uncertain = sorted((row for row in rows if row["confidence"] < _LOW_CONFIDENCE), key=lambda row: row["confidence"])
@@ -297,10 +276,7 @@ def _learned(path: Path) -> Learned | None:
 
 @explain_missing_packages()
 def delete_masks(folder: Path) -> None:
-    """Delete the masks and records that a segmentation wrote to a folder, and the folders left empty.
-
-    Other files are kept, and so are folders that segmentation did not write.
-    """
+    """Delete the masks and records that a segmentation wrote to a folder, and the folders left empty."""
     if not (folder / RECORD).is_file():
         return
     from jawusd.segmentation.colours import state_files
@@ -320,12 +296,8 @@ def with_masks(capture: Capture, folder: Path) -> Capture:
     """Return the capture with the masks that `segment_teeth` wrote to a folder."""
     from jawusd.segmentation.files import ARCHES, mask_pattern
 
-    cameras = tuple(
-        camera
-        if camera.video is None
-        else camera.model_copy(
-            update={"masks": Masks(**{arch: mask_pattern(folder, camera.name, arch) for arch in ARCHES})}
-        )
-        for camera in capture.cameras
-    )
-    return capture.model_copy(update={"cameras": cameras})
+    def masked(camera: CameraSource) -> CameraSource:
+        masks = Masks(**{arch: mask_pattern(folder, camera.name, arch) for arch in ARCHES})
+        return camera if camera.video is None else camera.model_copy(update={"masks": masks})
+
+    return capture.model_copy(update={"cameras": tuple(map(masked, capture.cameras))})

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
-from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, NotRequired, TypedDict, cast
+from typing import Literal, NotRequired, TypedDict, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,15 +24,18 @@ from jawusd.pipeline.pictures import VIDEO, write_overlay
 from jawusd.pipeline.segment_guide import combine_guide
 from jawusd.pipeline.skin import SkinOptions
 from jawusd.pipeline.solve_report import check_page, solve_limits, write_solve_report
+from jawusd.pipeline.solve_skin import SkinOfFootage, SkinOfShot, skin_of_footage
 from jawusd.pipeline.solve_videos import VideoOptions, solve_videos
 from jawusd.pipeline.state import Progress, no_progress
 from jawusd.pipeline.subject import load_labelled, registered_meshes
 from jawusd.pipeline.track import tracking_config
 from jawusd.pipeline.workspace import open_capture
-
-if TYPE_CHECKING:
-    from jawusd.pipeline.solve_skin import SkinOfShot
-
+from jawusd.rig import write_animation
+from jawusd.rig.rebake import write_over
+from jawusd.tracking.contour.scan import prepare_scan
+from jawusd.tracking.performance.results import tracks_of
+from jawusd.tracking.performance.shot import solve_capture
+from jawusd.tracking.performance.skin_alone import solve_by_skin
 
 SUFFIXES = (".csv", ".npz", ".usdc", ".usda")
 _USD = (".usd", ".usda", ".usdc", ".usdz")
@@ -54,17 +55,16 @@ class SolveSummary(TypedDict):
     frames: int
     solved: int
     carried: list[tuple[int, int]]  # runs of frames, as (first, last), in which an arch is occluded
-    skin: list[tuple[int, int]]  # Runs of frames, as (first, last), in which d is estimated from facial skin.
-    lost: list[tuple[int, int]]  # Runs of frames, as (first, last), in which no pose fits the images.
+    skin: list[tuple[int, int]]  # runs of frames in which d is estimated from facial skin
+    lost: list[tuple[int, int]]  # runs of frames in which no pose fits the images
     within_tolerance: int  # number of frames outside the bound, but within the tolerance of measured poses
     outside: int  # number of frames outside the bound by more than the tolerance
     cameras: list[str]
     sigma_mm: dict[str, float]  # median standard deviation of d1, d2, d3 over solved frames, if any
     worst_sigma_mm: dict[str, float]  # maximum standard deviation over all frames
     limits: str  # what limits the accuracy, in words
-    focal: NotRequired[
-        dict[str, tuple[float, float]]
-    ]  # ratio of estimated to calibrated focal length, and its standard deviation, by camera
+    #: ratio of estimated to calibrated focal length, and its standard deviation, by camera
+    focal: NotRequired[dict[str, tuple[float, float]]]
     skin_learned: NotRequired[SkinLearned]
     skin_offset_s: NotRequired[float]  # seconds from frame 0 of the shot to frame 0 of the face data
     unfamiliar: NotRequired[list[tuple[int, int]]]  # runs of `skin` with a face unlike those of the calibration
@@ -101,7 +101,6 @@ def solve(
         fixed_head: the cameras are head-mounted.
         free_focal: estimate the focal lengths; those of the calibration may then be wrong by up to 10 %.
         jobs: number of threads; the result does not depend on it.
-        allow_outside: allow paths in the capture that point outside its folder.
         skin: facial skin data of the shot, which determine d in frames with hidden teeth. With them, the shot needs no
             images. "footage": points on the skin are followed in the videos of two or more cameras, and d is learned
             from them in the frames with visible teeth.
@@ -113,16 +112,14 @@ def solve(
         TrackingError: the teeth cannot be found in the masks or the videos.
         OutputError: a file cannot be written.
     """
-    from jawusd.pipeline.solve_skin import SkinOfFootage, SkinOfShot, skin_of_footage
-    from jawusd.tracking.performance.results import tracks_of
-
     check_output(rig, out, overlay, report)
     progress = progress or no_progress
     capture = open_capture(shot, allow_outside=allow_outside)
     jaw = jawusd.load(rig, prim=prim)
     by_skin = SkinOfShot(jaw, skin, capture.fps) if isinstance(skin, SkinOptions) else None
     learned: SkinOfFootage | None = None
-    if isinstance(skin, SkinOptions) and by_skin is not None and (skin.only or not _has_images(capture)):
+    has_images = any(camera.masks or camera.video for camera in capture.cameras)
+    if isinstance(skin, SkinOptions) and by_skin is not None and (skin.only or not has_images):
         if overlay is not None:
             raise OutputError("needs the head pose, which cannot be estimated from skin alone.", path=overlay)
         offsets: dict[str, int] = {}
@@ -132,7 +129,12 @@ def solve(
         if skin == "footage":
             learned = skin_of_footage(capture, jaw, offsets, free_focal, progress)
         options = VideoOptions(fixed_head, free_focal, jobs, by_skin or learned)
-        found, findings = _from_images(capture, jaw, offsets, options, progress)
+        try:
+            found, findings = _from_images(capture, jaw, offsets, options, progress)
+        except TrackingError as error:
+            if by_skin is not None:
+                error.hint = f"{error.hint or ''} If no frame shows the teeth, use --skin-only.".strip()
+            raise
     if by_skin is not None:
         found.notes |= {"skin_offset_s": by_skin.offset_s, "unfamiliar": by_skin.unfamiliar.tolist()}
     if learned is not None:
@@ -152,10 +154,7 @@ def _from_images(
     capture: Capture, jaw: JawRig, offsets: dict[str, int], options: VideoOptions, progress: Progress
 ) -> tuple[Performance, list[Finding]]:
     """Return the performance solved from masks or images of the teeth, and findings about the scans."""
-    from jawusd.tracking.performance.results import tracks_of
-    from jawusd.tracking.performance.shot import solve_capture
-
-    with naming_file(capture.folder / "capture.toml"), _naming_skin_only(options):
+    with naming_file(capture.folder / "capture.toml"):
         cameras = load_cameras(capture)
         meshes, findings = load_labelled(capture)
         meshes = registered_meshes(meshes, jaw.meta)
@@ -180,29 +179,8 @@ def _from_images(
     return found, findings
 
 
-@contextmanager
-def _naming_skin_only(options: VideoOptions) -> Iterator[None]:
-    """Add a hint to errors about the teeth, if facial skin is available."""
-    try:
-        yield
-    except TrackingError as error:
-        from jawusd.pipeline.solve_skin import SkinOfShot
-
-        if isinstance(options.skin, SkinOfShot):
-            error.hint = f"{error.hint or ''} If no frame shows the teeth, use --skin-only.".strip()
-        raise
-
-
-def _has_images(capture: Capture) -> bool:
-    """Return whether a camera of a capture has masks or a video."""
-    return any(camera.masks is not None or camera.video is not None for camera in capture.cameras)
-
-
 def _from_skin(capture: Capture, jaw: JawRig, skin: SkinOfShot) -> tuple[Performance, list[Finding]]:
     """Return the performance estimated from facial skin alone, and findings about the scans."""
-    from jawusd.tracking.contour.scan import prepare_scan
-    from jawusd.tracking.performance.skin_alone import solve_by_skin
-
     with naming_file(capture.folder / "capture.toml"):
         meshes, findings = load_labelled(capture)
         meshes = registered_meshes(meshes, jaw.meta)
@@ -220,30 +198,19 @@ def write_solved(
     fps: float,
     prim: str | None = None,
 ) -> None:
-    """Write a performance to a file whose suffix selects the format; see `solve`.
-
-    Raises:
-        OutputError: the file cannot be written.
-        RigError: an animation layer of the rig cannot be written.
-    """
+    """Write a performance to a file whose suffix selects the format; see `solve`."""
     suffix = Path(out).suffix.lower()
     if suffix == ".csv":
         write_performance(out, performance, fps)
     elif suffix == ".npz":
-        from jawusd.tracking.performance.results import tracks_of
-
         save_tracks(out, tracks_of(performance, jaw))
     else:
-        from jawusd.rig import write_animation
-        from jawusd.rig.rebake import write_over
-
-        state = performance.state
-        unseen = performance.frames[(state == SolveState.CARRIED) | (state == SolveState.LOST)]
-        by_skin = performance.frames[state == SolveState.SKIN]
+        frames, d, state = performance.frames, performance.d, performance.state
+        unseen = frames[(state == SolveState.CARRIED) | (state == SolveState.LOST)]
+        by_skin = frames[state == SolveState.SKIN]
         if prim is not None:
-            write_over(out, rig, jaw, performance.frames, performance.d, fps, prim, unseen, by_skin)
+            write_over(out, rig, jaw, frames, d, fps, prim, unseen, by_skin)
         else:
-            frames, d = performance.frames, performance.d
             write_animation(out, rig, frames, d, fps, rig=jaw, carried=unseen, by_skin=by_skin)
 
 
@@ -281,7 +248,10 @@ def solve_summary(performance: Performance) -> SolveSummary:
     sigma = p.sigma_d
     typical = np.median(sigma[solved] if solved.any() else sigma, axis=0)
     by_skin = p.frames[p.state == SolveState.SKIN]
-    names = ("d1", "d2", "d3")
+    median, largest = (
+        {name: round(float(value), 4) for name, value in zip(("d1", "d2", "d3"), values, strict=True)}
+        for values in (typical, sigma.max(axis=0))
+    )
     summary = SolveSummary(
         frames=len(p.frames),
         solved=int(solved.sum()),
@@ -291,8 +261,8 @@ def solve_summary(performance: Performance) -> SolveSummary:
         within_tolerance=int((p.valid & ~is_inside(p.margin_mm)).sum()),
         outside=int((~p.valid).sum()),
         cameras=list(p.camera_names),
-        sigma_mm={name: round(float(value), 4) for name, value in zip(names, typical, strict=True)},
-        worst_sigma_mm={name: round(float(value), 4) for name, value in zip(names, sigma.max(0), strict=True)},
+        sigma_mm=median,
+        worst_sigma_mm=largest,
         limits=solve_limits(p.camera_names),
         findings=cast("list[dict[str, str | float | int]]", p.notes.get("findings", [])),
     )
@@ -308,10 +278,5 @@ def solve_summary(performance: Performance) -> SolveSummary:
 
 def _runs(frames: NDArray[np.int64]) -> list[tuple[int, int]]:
     """Return the first and the last frame of each run of consecutive frames (F,)."""
-    runs: list[tuple[int, int]] = []
-    for frame in frames.tolist():
-        if runs and runs[-1][1] == frame - 1:
-            runs[-1] = (runs[-1][0], frame)
-        else:
-            runs.append((frame, frame))
-    return runs
+    runs = np.split(frames, np.flatnonzero(np.diff(frames) != 1) + 1)
+    return [(int(run[0]), int(run[-1])) for run in runs if len(run)]

@@ -6,7 +6,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING
 
 from jawusd.base.arrays import Array
 from jawusd.evaluator import JawRig
@@ -19,12 +18,14 @@ from jawusd.pipeline.picture_search import PictureSearch, Start, least_fit
 from jawusd.pipeline.state import Progress
 from jawusd.pipeline.subject import subject_of_capture
 from jawusd.pipeline.track_videos import Cutter
-
-if TYPE_CHECKING:
-    from jawusd.tracking.config import Mapper
-    from jawusd.tracking.performance.coordinates import Pose
-    from jawusd.tracking.performance.skin import SkinOf
-    from jawusd.tracking.region.appearance import Cut
+from jawusd.segmentation.picture import ColourFootage
+from jawusd.tracking.config import Mapper
+from jawusd.tracking.contour.scan import prepare_scan
+from jawusd.tracking.performance.coordinates import Pose
+from jawusd.tracking.performance.skin import SkinOf
+from jawusd.tracking.region.appearance import Cut
+from jawusd.tracking.region.performance import PictureShot, PictureTake
+from jawusd.tracking.region.picture_start import PictureStart
 
 
 @dataclass(frozen=True)
@@ -41,20 +42,12 @@ class PreparedTeeth:
     """The scans of a subject, prepared for tracking.
 
     Attributes:
-        scans: upper and lower teeth.
         axes: rotation from scan to anatomical axes (left, up, front), shape (3, 3).
-        search: function object that finds the teeth in rough masks.
+        search: finds the teeth in rough masks.
     """
 
     def __init__(self, capture: Capture, meshes: Mapping[str, Mesh], jaw: JawRig, map_: Mapper) -> None:
-        """Prepare the scans of a capture, registered as in the rig; the search calls `map_` to run in parallel.
-
-        Raises:
-            TrackingError: the scans are not in occlusion.
-        """
-        from jawusd.tracking.contour.scan import prepare_scan
-        from jawusd.tracking.region.picture_start import PictureStart
-
+        """Prepare the scans, registered as in the rig; raises TrackingError if they are not in occlusion."""
         teeth = meshes["upper_teeth"], meshes["lower_teeth"]
         self.scans = prepare_scan(teeth[0], "upper"), prepare_scan(teeth[1], "lower")
         self.axes = subject_of_capture(capture, meshes).T_anatomical_skull[:3, :3]
@@ -62,13 +55,7 @@ class PreparedTeeth:
 
 
 class VideoShot:
-    """A shot, opened from the videos of its cameras.
-
-    Attributes:
-        cameras: calibrated cameras with a video, by name.
-        footage: the images of those cameras.
-        take: tracker of the teeth.
-    """
+    """A shot, opened from the videos of its calibrated cameras."""
 
     def __init__(
         self,
@@ -80,14 +67,7 @@ class VideoShot:
         options: VideoOptions,
         progress: Progress,
     ) -> None:
-        """Open the videos of calibrated cameras, by name.
-
-        Raises:
-            CaptureError: no camera has a video, or one cannot be decoded.
-        """
-        from jawusd.segmentation.picture import ColourFootage
-        from jawusd.tracking.region.performance import PictureShot, PictureTake
-
+        """Open the videos of calibrated cameras, given by name."""
         videos = open_videos(capture)
         self._picks, self._teeth, self._progress = capture.bootstrap, teeth, progress
         self.cameras = {name: camera for name, camera in cameras.items() if name in videos}
@@ -104,8 +84,9 @@ class VideoShot:
         )
         self._frames = shot.frames
         self.take = PictureTake(jaw, teeth.scans, teeth.axes, shot)
-        footage = self.footage, self.cameras, offsets
-        self._search: PictureSearch[Pose] = PictureSearch(*footage, teeth.search, self.take.begun)
+        self._search: PictureSearch[Pose] = PictureSearch(
+            self.footage, self.cameras, offsets, teeth.search, self.take.begun
+        )
 
     def _cuts(self, placed: Sequence[Camera], centre: Array, frames: range) -> Iterator[Cut]:
         table = {camera.name: camera for camera in placed}
@@ -124,7 +105,7 @@ class VideoShot:
         return self._search.run(self._frames, self._progress)
 
     def _again(self, frames: range, up_world: Array) -> tuple[int, Pose]:
-        """Search in frames in which the teeth were lost; `up_world` is as in `PictureSearch.run`."""
+        """Search in frames in which the teeth were lost; see `PictureSearch.run`."""
         begin = self._search.run(frames, self._progress, up_world)
         return begin.frame, begin.pose
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, NotRequired, cast
+from typing import TYPE_CHECKING, Literal, NotRequired, cast
 
 import numpy as np
 from typing_extensions import TypedDict
@@ -29,11 +29,9 @@ from jawusd.geometry import LANDMARKS
 from jawusd.pipeline.calibrate import sync_cameras
 from jawusd.pipeline.cameras import load_cameras, rescaled_cameras
 from jawusd.pipeline.pictures import write_overlay
-from jawusd.pipeline.segment_guide import combine_guide
 from jawusd.pipeline.segment_record import auto_masks_folder
 from jawusd.pipeline.state import Progress, no_progress
 from jawusd.pipeline.subject import load_labelled, load_meshes, registered_meshes, subject_of_capture
-from jawusd.pipeline.track_videos import track_videos
 from jawusd.pipeline.workspace import open_capture
 
 if TYPE_CHECKING:
@@ -99,7 +97,6 @@ def track(
         model: jaw model of this subject, used as a prior when uncertain frames are tracked again.
         overlay: folder or .mp4 file to write, with videos of the tracked scans over the footage; see `write_overlay`.
         jobs: number of threads; the result does not depend on it.
-        allow_outside: allow paths in the capture that point outside its folder.
 
     Raises:
         FormatError, CaptureError: the capture, or one of its masks or videos, cannot be read.
@@ -130,40 +127,27 @@ def first_pass(
     solver: str = "contour",
     backend: str = "cpu",
 ) -> Tracks:
-    """Track both arches without a jaw model; other parameters and errors are as for `track`.
-
-    Args:
-        offsets: frame offset by camera.
-    """
+    """Track both arches without a jaw model; parameters and errors are as for `track`."""
+    from jawusd.pipeline.segment_guide import combine_guide
+    from jawusd.pipeline.track_videos import track_videos
     from jawusd.tracking import track_capture
     from jawusd.tracking.region.condyle_fusion import widen_strained
 
     with naming_file(capture.folder / "capture.toml"):
         cameras, (meshes, findings) = load_cameras(capture), load_labelled(capture)
-        upper, lower = meshes["upper_teeth"], meshes["lower_teeth"]
+        given = capture, cameras, offsets, meshes["upper_teeth"], meshes["lower_teeth"]
         report = partial(progress, "track")
         if solver == "paper":
             from jawusd.paper.take import track_capture_paper  # needs torch, which takes seconds to import
 
-            tracks = track_capture_paper(
-                capture,
-                cameras,
-                offsets,
-                upper,
-                lower,
-                backend="gl" if backend == "gl" else "cpu",
-                threads=jobs,
-                progress=report,
-            )
+            renderer: Literal["cpu", "gl"] = "gl" if backend == "gl" else "cpu"
+            tracks = track_capture_paper(*given, backend=renderer, threads=jobs, progress=report)
         elif not any(camera.masks for camera in capture.cameras):
             tracks = track_videos(capture, offsets, meshes, jobs, progress)
         else:
-            subject = subject_of_capture(capture, meshes)
+            subject, config = subject_of_capture(capture, meshes), tracking_config(capture)
             landmarks = subject.landmarks
-            config = tracking_config(capture)
-            tracks = track_capture(
-                capture, cameras, offsets, upper, lower, landmarks, config, threads=jobs, progress=report
-            )
+            tracks = track_capture(*given, landmarks, config, threads=jobs, progress=report)
             tracks, disagreements = combine_guide(capture, tracks, landmarks)
             if auto_masks_folder(capture) is not None:
                 tracks = widen_strained(tracks, landmarks, subject.T_anatomical_skull[:3, :3])
@@ -180,13 +164,7 @@ def model_pass(
 ) -> Tracks:
     """Track uncertain frames again with the fitted model as a prior.
 
-    Captures without masks are not tracked again; their poses are combined with the model.
-
-    Other parameters and errors are as for `track`.
-
-    Args:
-        offsets: frame offset by camera.
-        tracks: the first pass.
+    Captures without masks are not tracked again; their poses are combined with the model. For errors, see `track`.
     """
     from jawusd.tracking.sequence.kinematic_prior import weigh_with_model
     from jawusd.tracking.sequence.model_refinement import refine_tracks
@@ -250,16 +228,10 @@ def lost_reasons(tracks: Tracks) -> dict[str, dict[str, int]]:
 
 
 def frame_summary(tracks: Tracks, frame: int) -> FrameTrackSummary:
-    """Return how one frame was tracked.
-
-    Raises:
-        TrackingError: the tracks do not contain the frame.
-    """
+    """Return how one frame was tracked; raises TrackingError if the tracks do not contain it."""
     if frame not in tracks.frames:
-        raise TrackingError(
-            f"the tracks do not contain this frame; they run from {tracks.frames[0]} to {tracks.frames[-1]}",
-            frame=frame,
-        )
+        message = f"the tracks do not contain this frame; they run from {tracks.frames[0]} to {tracks.frames[-1]}"
+        raise TrackingError(message, frame=frame)
     k = int(np.searchsorted(tracks.frames, frame))
     cameras = np.array(tracks.camera_names)
     arches: dict[str, ArchSummary] = {}

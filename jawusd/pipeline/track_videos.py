@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from functools import partial
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -21,16 +20,15 @@ from jawusd.pipeline.cameras import open_colour_footage
 from jawusd.pipeline.picture_search import PictureSearch, Start
 from jawusd.pipeline.state import Progress
 from jawusd.pipeline.subject import Subject, subject_of_capture
-
-if TYPE_CHECKING:
-    from jawusd.segmentation.picture import ColourFootage, PictureFrame, Pictures
-    from jawusd.tracking.config import Mapper
-    from jawusd.tracking.contour.scan import Scan
-    from jawusd.tracking.contour.views import View
-    from jawusd.tracking.follow import Begin
-    from jawusd.tracking.region.appearance import Cut, Picture
-    from jawusd.tracking.region.tracker import RegionPose, RegionTracker
-
+from jawusd.segmentation.picture import ColourFootage, PictureFrame, Pictures
+from jawusd.tracking.config import Mapper
+from jawusd.tracking.contour.scan import Scan, prepare_scan, teeth_centre
+from jawusd.tracking.contour.views import View
+from jawusd.tracking.follow import Begin, TwoWays
+from jawusd.tracking.region.appearance import Cut, Picture
+from jawusd.tracking.region.picture_start import ArchStart
+from jawusd.tracking.region.take import TakeFacts, footage_findings, tracks_of
+from jawusd.tracking.region.tracker import RegionPose, RegionTracker
 
 _WORKING_PX_PER_MM, _MARGIN_MM = 7.2, 6.0  # resolution at the teeth, and margin around them, in cropped images
 
@@ -41,16 +39,7 @@ class Cutter:
     def __init__(
         self, cameras: Mapping[str, Camera], scans: Sequence[Scan], centre: Array, executor: Executor | None = None
     ) -> None:
-        """Choose the working resolution of every camera.
-
-        Args:
-            cameras: calibrated cameras by name.
-            scans: upper and lower scan.
-            centre: approximate position of the teeth in the world [mm], shape (3,).
-            executor: threads for the images of all cameras.
-        """
-        from jawusd.segmentation.picture import PictureFrame
-
+        """Choose the working resolution of every camera, at about `centre`, the teeth in the world [mm] (3,)."""
         self._frames: dict[str, PictureFrame] = {
             name: PictureFrame(camera, centre, _WORKING_PX_PER_MM) for name, camera in cameras.items()
         }
@@ -67,16 +56,10 @@ class Cutter:
         return cut
 
     def walk(self, footage: ColourFootage, frames: range) -> Iterator[Cut]:
-        """Yield the function returned by `cut` for each frame.
-
-        Raises:
-            CaptureError: an image cannot be decoded.
-        """
+        """Yield the function returned by `cut` for each frame."""
         return (self.cut(pictures) for _, pictures in footage.walk(frames))
 
     def _one(self, name: str, pictures: Pictures, around: Array) -> Picture | None:
-        from jawusd.tracking.region.appearance import Picture
-
         image = pictures[name]
         window = None if image is None else self._frames[name].window(image, around, _MARGIN_MM)
         return None if window is None else Picture(window.camera, window.rgb)
@@ -90,7 +73,6 @@ class Follower:
     """Tracker of both arches from a start frame to both ends of a take.
 
     Attributes:
-        cameras: the calibrated cameras that have a video, by name.
         sampled_views: poses and views of evenly sampled frames of the last run.
     """
 
@@ -102,14 +84,7 @@ class Follower:
         subject: Subject,
         pool: Executor | None = None,
     ) -> None:
-        """Prepare the tracker.
-
-        Args:
-            footage, cameras: the images, and the calibrated cameras by name.
-            scans: upper and lower scan, prepared for tracking.
-            subject: provides axes and condyles.
-            pool: threads for the cameras.
-        """
+        """Prepare the tracker; the subject provides axes and condyles."""
         self.cameras = cameras
         self._footage, self._scans, self._subject = footage, scans, subject
         self._pool = pool
@@ -120,14 +95,7 @@ class Follower:
         """Refine T_world_upper, T_world_lower (2, 4, 4) in the frame from which `run` will start; return them, and fit.
 
         The fit is the fraction of the visible contour that matches the colours, 0 .. 1, for the worse arch.
-
-        Raises:
-            CaptureError: an image cannot be decoded.
         """
-        from jawusd.tracking.contour.scan import teeth_centre
-        from jawusd.tracking.follow import Begin
-        from jawusd.tracking.region.tracker import RegionTracker
-
         cutter = Cutter(self.cameras, self._scans, teeth_centre(self._scans, poses), self._pool)
         axes = self._subject.T_anatomical_skull[:3, :3]
         landmarks, cameras = self._subject.landmarks, list(self.cameras.values())
@@ -145,16 +113,7 @@ class Follower:
         return begin
 
     def run(self, frames: range, search: PictureSearch[Array], progress: Progress) -> dict[int, RegionPose]:
-        """Return the poses of all frames, starting from the frame last passed to `start_at`.
-
-        Args:
-            search: used where the teeth are lost for several frames; it judges poses by `start_at`.
-
-        Raises:
-            CaptureError: an image cannot be decoded.
-        """
-        from jawusd.tracking.follow import TwoWays
-
+        """Return the poses of all frames, from the frame last passed to `start_at`; search where the teeth are lost."""
         points, up = self._subject.landmarks[:3], self._subject.T_anatomical_skull[1, :3]
 
         def again(lost: range, near: RegionPose) -> Begin[RegionPose]:
@@ -206,18 +165,10 @@ def track_videos(
 ) -> Tracks:
     """Track both arches using the colours of the videos; see `track`.
 
-    Args:
-        offsets: frame offset by camera.
-        meshes: labelled meshes of the capture.
-
     Raises:
         CaptureError: fewer than two cameras have a video, or one cannot be decoded.
         TrackingError: the teeth were not found.
     """
-    from jawusd.tracking.contour.scan import prepare_scan
-    from jawusd.tracking.region.picture_start import ArchStart
-    from jawusd.tracking.region.take import TakeFacts, footage_findings, tracks_of
-
     cameras, footage = open_colour_footage(capture, offsets, "tracking without masks")
     frames = range(*(capture.frames or footage.range()))
     subject = subject_of_capture(capture, meshes)

@@ -52,7 +52,7 @@ def searched(monkeypatch):
             masks = np.where(np.arange(16).reshape(4, 4) < np.reshape(seen(int(picture)), (2, 1, 1)), 255, 0)
             return Rows(masks.astype(np.uint8), 0.05) if upright in (turns, None) else None
 
-        monkeypatch.setattr("jawusd.segmentation.rows.tooth_rows", rows)
+        monkeypatch.setattr("jawusd.pipeline.picture_search.tooth_rows", rows)
         footage, tried, fits = _Footage(), [], []
 
         def near(sources, cameras, offsets, frame):
