@@ -7,14 +7,15 @@ from __future__ import annotations
 
 import os
 import platform
+import re
 import shutil
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from contextlib import ExitStack
 from importlib.metadata import PackageNotFoundError, metadata, requires, version
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TypedDict
+from typing import NamedTuple, TypedDict
 
 from jawusd.base.errors import CaptureError, JawusdError
 from jawusd.base.guard import machine_memory, memory_limit
@@ -32,8 +33,7 @@ _FOR_REPORT = ("matplotlib", "jinja2")
 _RIG_MB, _LEAST_MB = 200.0, 20.0
 
 
-@dataclass(frozen=True)
-class _Check:
+class _Check(NamedTuple):
     """One check: what it checks, the loaded parts it needs, and its function."""
 
     what: str
@@ -42,14 +42,12 @@ class _Check:
 
 
 def _packages(parts: Parts) -> Iterator[Finding]:
-    missing = [name for name in _NEEDED if find_spec(name) is None]
-    if missing:
-        names = ", ".join(missing)
-        message = f"the packages {names} are not installed"
-        yield Finding("packages_missing", "error", message, hint="Install them with: pip install 'jawusd[build]'")
+    hint = "Install them with: pip install 'jawusd[build]'"
+    if missing := [name for name in _NEEDED if find_spec(name) is None]:
+        yield Finding("packages_missing", "error", f"the packages {', '.join(missing)} are not installed", hint=hint)
     if lacking := [name for name in _FOR_REPORT if find_spec(name) is None]:
         message = f"the packages {', '.join(lacking)} are not installed; no report will be written"
-        yield Finding("no_report", "warning", message, hint="Install them with: pip install 'jawusd[build]'")
+        yield Finding("no_report", "warning", message, hint=hint)
 
 
 def _disk(parts: Parts) -> Iterator[Finding]:
@@ -83,7 +81,7 @@ def check_capture(
     out: str | os.PathLike[str] | None = None,
     *,
     allow_outside: bool = False,
-    progress: Progress | None = None,
+    progress: Progress = no_progress,
 ) -> list[Finding]:
     """Return all errors and warnings that can be found in a capture within seconds; errors come first.
 
@@ -92,10 +90,7 @@ def check_capture(
     Args:
         capture: the capture, its capture.toml or the folder of that file.
         out: folder in which the rig will be built, for the check of disk space; default: the capture's folder.
-        allow_outside: allow paths in the capture that point outside its folder.
-        progress: called with (stage, done, total) as work proceeds.
     """
-    progress = progress or no_progress
     findings: list[Finding] = []
     loaded: Capture | None
     if isinstance(capture, Capture):
@@ -104,8 +99,10 @@ def check_capture(
         loaded, problems = read_capture(capture, allow_outside=allow_outside)
         findings += [found_error("capture", problem) for problem in problems]
     folder = loaded.folder if loaded is not None else Path(str(capture))
-    # If the caller passed a loaded capture, its paths have been checked already.
-    with Parts(loaded, Path(out or folder).resolve(), allow_outside or isinstance(capture, Capture)) as parts:
+    with ExitStack() as open_files:
+        # If the caller passed a loaded capture, its paths have been checked already.
+        allowed = allow_outside or isinstance(capture, Capture)
+        parts = Parts(loaded, Path(out or folder).resolve(), allowed, open_files)
         for done, check in enumerate(_CHECKS):
             progress("check", done, len(_CHECKS))
             findings += _run(check, parts)
@@ -133,27 +130,21 @@ def _run(check: _Check, parts: Parts) -> list[Finding]:
         found.append(found_error("capture", error))
     except Exception as error:  # a failing check must not hide the findings of others
         message = f"{check.what} could not be checked ({type(error).__name__}: {error})"
-        found.append(
-            Finding("check_failed", "warning", message, hint="Inspect these files, and please report this as a bug.")
-        )
+        hint = "Inspect these files, and please report this as a bug."
+        found.append(Finding("check_failed", "warning", message, hint=hint))
     return found
 
 
 def _without_duplicates(findings: Sequence[Finding]) -> list[Finding]:
-    """Return findings without duplicates, i.e. findings with equal message, and equal file or camera."""
-    unique: dict[tuple[str, str | None, str | None], Finding] = {}
+    """Return the first of all findings with equal message, and equal file or camera."""
+    unique: dict[tuple[str, str | None], Finding] = {}
     for finding in findings:
-        key = (finding.message, finding.path, None if finding.path else finding.camera)
-        unique.setdefault(key, finding)
+        unique.setdefault((finding.message, finding.path or finding.camera), finding)
     return list(unique.values())
 
 
 def refuse_errors(findings: Sequence[Finding], capture: Capture) -> None:
-    """Raise one exception that lists all findings that are errors.
-
-    Raises:
-        CaptureError: at least one finding is an error.
-    """
+    """Raise a CaptureError that lists all findings that are errors, if there are any."""
     errors = [finding for finding in findings if finding.severity == "error"]
     if not errors:
         return
@@ -165,49 +156,38 @@ def refuse_errors(findings: Sequence[Finding], capture: Capture) -> None:
     raise CaptureError(f"the check found {len(errors)} errors:{listed}", path=path)
 
 
-_NEEDED_TO_BUILD = ("build",)
 _NEEDED_CODECS = ("h264", "ffv1", "png")
 _LEAST_FREE_GB = 1.0
 
 
 class Examined(TypedDict):
-    """Result of `jawusd doctor`.
-
-    Attributes:
-        versions: version of each package; "" if not installed.
-        extras: missing packages by pip extra.
-        graphics: OpenGL version, or the reason why OpenGL is not available.
-        codecs: for each codec, whether it can be decoded.
-        memory_limit_gb: memory limit of a command [GB]; 0: no limit.
-        problems: reasons why a build would fail.
-    """
+    """Result of `jawusd doctor`."""
 
     jawusd: str
     python: str
     system: str
     cores: int
     memory_gb: float | None
-    memory_limit_gb: float
-    versions: dict[str, str]
-    extras: dict[str, list[str]]
-    graphics: str
-    codecs: dict[str, bool]
+    memory_limit_gb: float  # memory limit of a command [GB]; 0: no limit
+    versions: dict[str, str]  # version of each package; "" if not installed
+    extras: dict[str, list[str]]  # missing packages by pip extra
+    graphics: str  # OpenGL version, or the reason why OpenGL is not available
+    codecs: dict[str, bool]  # for each codec, whether it can be decoded
     cache: str
     free_gb: float
-    problems: list[str]
+    problems: list[str]  # reasons why a build would fail
 
 
 def examine() -> Examined:
     """Check package versions, extras, OpenGL, codecs, CPU cores and the cache of compiled code."""
-    extras = _extras()
+    given = metadata("jawusd").get_all("Provides-Extra") or []
+    extras = {name: _required(name) for name in given if name not in ("all", "test")}
     names = sorted({name for packages in extras.values() for name in packages} | set(_required("")))
     versions = {name: _version(name) for name in names}
     lacking = {extra: [name for name in packages if not versions[name]] for extra, packages in extras.items()}
-    problems = [
-        f"the extra {extra} lacks {', '.join(lacking[extra])}: pip install 'jawusd[{extra}]'"
-        for extra in _NEEDED_TO_BUILD
-        if lacking.get(extra)
-    ]
+    problems = []
+    if lacking.get("build"):
+        problems.append(f"the extra build lacks {', '.join(lacking['build'])}: pip install 'jawusd[build]'")
     codecs = _codecs()
     lost = [name for name in _NEEDED_CODECS if codecs.get(name) is False]
     problems += [f"images in {name} cannot be decoded" for name in lost]
@@ -235,19 +215,11 @@ def _required(extra: str) -> list[str]:
     """Return the names of the packages required by jawusd, or by one of its extras."""
     out = []
     for line in requires("jawusd") or ():
-        name = line.partition(";")[0]
-        for sign in "<>=!~[ (":
-            name = name.partition(sign)[0]
-        marker = line.partition(";")[2]
+        name, marker = re.split(r"[<>=!~\[ (;]", line, maxsplit=1)[0], line.partition(";")[2]
         wanted = f'extra == "{extra}"' in marker.replace("'", '"') if extra else "extra" not in marker
         if wanted and name.lower() != "jawusd":
             out.append(name)
     return out
-
-
-def _extras() -> dict[str, list[str]]:
-    names = metadata("jawusd").get_all("Provides-Extra") or []
-    return {name: _required(name) for name in names if name not in ("all", "test")}
 
 
 def _version(name: str) -> str:

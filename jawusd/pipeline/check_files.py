@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import contextlib
 import filecmp
 from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from itertools import combinations
 from pathlib import Path
-from types import TracebackType
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -29,22 +28,19 @@ if TYPE_CHECKING:
     from jawusd.tracking.contour.scan import Scan
 
 
-Size = tuple[int, int]
-
-
 @dataclass
 class Parts:
-    """Parts of a capture loaded by the checks, empty if unreadable; as a context manager, it closes the masks."""
+    """Parts of a capture loaded by the checks, empty if unreadable."""
 
     capture: Capture | None
     out: Path  # future folder of the rig
     allow_outside: bool
+    open_files: ExitStack  # closes the masks
     meshes: dict[str, Mesh] = field(default_factory=dict)
     scans: tuple[Scan, ...] = ()  # upper and lower scan, if both are usable
     videos: dict[str, Clip] = field(default_factory=dict)
     cameras: dict[str, Camera] = field(default_factory=dict)
     samples: dict[str, MaskSamples] = field(default_factory=dict)
-    open_files: contextlib.ExitStack = field(default_factory=contextlib.ExitStack)
 
     @property
     def description(self) -> str:
@@ -53,11 +49,7 @@ class Parts:
 
     @property
     def given(self) -> Capture:
-        """Return the capture.
-
-        Raises:
-            ValueError: the capture could not be read.
-        """
+        """Return the capture; raises ValueError if it could not be read."""
         if self.capture is None:
             raise ValueError("there is no capture")
         return self.capture
@@ -95,14 +87,6 @@ class Parts:
         if begin is not None:
             guesses.append({name: begin - own for name, own in first.items() if own is not None})
         return guesses
-
-    def __enter__(self) -> Parts:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.open_files.close()
 
 
 def found_error(kind: str, error: JawusdError) -> Finding:
@@ -154,18 +138,17 @@ def occlusion(parts: Parts) -> Iterator[Finding]:
 
 def bone_findings(parts: Parts) -> Iterator[Finding]:
     """Check the positions of bones and landmarks relative to the teeth."""
-    for bone, arch in zip(BONES, ("lower", "upper"), strict=True):
+    for bone, arch, scan in zip(BONES, ("lower", "upper"), reversed(parts.scans), strict=True):
         if bone not in parts.meshes:
             continue
-        crowns = parts.scans[("upper", "lower").index(arch)].crown_vertices(300)
         vertices = parts.meshes[bone].vertices
-        apart = float(np.median([np.linalg.norm(vertices - point, axis=1).min() for point in crowns]))
+        apart = np.median([np.linalg.norm(vertices - point, axis=1).min() for point in scan.crown_vertices(300)])
         if apart > _TEETH_TO_BONE_MM:
             yield Finding(
                 "bone_elsewhere",
                 "warning",
                 f"the {bone} is {apart:.0f} mm from the {arch} teeth; at most {_TEETH_TO_BONE_MM:g} mm is plausible",
-                apart,
+                float(apart),
                 _TEETH_TO_BONE_MM,
                 path=str(getattr(parts.given.scans, bone)),
                 hint="Export it in the coordinate frame of the scans, in mm.",
@@ -193,11 +176,9 @@ def clips(parts: Parts) -> Iterator[Finding]:
         if camera.clip is None or not parts.usable(camera.clip.path):
             continue
         try:
-            video = open_clip(camera.clip)
+            parts.videos[camera.name] = open_clip(camera.clip)
         except JawusdError as error:
             yield replace(found_error("clip", error), camera=camera.name)
-            continue
-        parts.videos[camera.name] = video
     with ThreadPoolExecutor() as pool:
         for found in pool.map(lambda item: list(decoded_findings(item[1], item[0])), parts.videos.items()):
             yield from found

@@ -46,15 +46,13 @@ def masks(parts: Parts) -> Iterator[Finding]:
             yield from survey_masks(source, size)
             sample = sample_masks(source, size, parts.open_files)
         except JawusdError as error:
-            found = found_error("masks", error)
             missing = True
-            yield replace(found, camera=source.name)
+            yield replace(found_error("masks", error), camera=source.name)
             continue
         if sample.first_frame is not None:
             parts.samples[source.name] = sample
     if len(parts.samples) < 2 and not missing:
-        names = ", ".join(parts.samples) or "none"
-        message = f"masks of at least two cameras are needed; usable: {names}"
+        message = f"masks of at least two cameras are needed; usable: {', '.join(parts.samples) or 'none'}"
         yield Finding("few_masks", "error", message, len(parts.samples), 2, path=parts.description)
 
 
@@ -167,11 +165,7 @@ def _teeth(parts: Parts, cameras: Mapping[str, Camera], instant: int, offsets: M
 
 
 def picks(parts: Parts) -> Iterator[Finding]:
-    """Check the picks for consistency, and against the masks.
-
-    Raises:
-        CaptureError: the picks are unusable.
-    """
+    """Check the picks for consistency, and against the masks; raises CaptureError if they are unusable."""
     from jawusd.tracking.initialization.pick_causes import Setting
     from jawusd.tracking.initialization.pick_checks import pick_findings
 
@@ -203,9 +197,7 @@ def _pixels(
 ) -> Callable[[str, str], tuple[Array, Array]]:
     """Return a function that returns the mask pixels of one camera by arch, as if they were the masks of another.
 
-    Args:
-        instant: frame number of the reference camera.
-        numbered: 0 if the masks are numbered by the frames of the other camera, 1 if by those of their own.
+    The masks are numbered by the frames of the other camera if `numbered` is 0, and by those of their own if it is 1.
     """
 
     @cache
