@@ -27,11 +27,7 @@ _TEETH_APART_MM = 15.0  # maximum distance between the (picked or detected) toot
 
 
 def check_same_jaw(subject: Subject, model: JawModel) -> None:
-    """Check that a model and a subject's scans have the same coordinate frame, by comparing their tooth landmarks.
-
-    Raises:
-        RigError: the landmarks are too far apart.
-    """
+    """Raise RigError if the tooth landmarks of a model and of a subject's scans are far apart."""
     apart = np.linalg.norm(model.arrays["landmarks"][:3] - subject.landmarks[:3], axis=1)
     if apart.max() > _TEETH_APART_MM:
         raise RigError(
@@ -57,7 +53,7 @@ def bake_subject(
     Args:
         fps: frame rate if the subject has none.
         table_size: knots per axis of the sampled decoder, 17, 33 or 65.
-        prim_name: name of the actor's prim; None: derived from the name of the subject.
+        prim_name: None: derived from the name of the subject.
 
     Raises:
         RigError, OutputError: the rig cannot be written.
@@ -100,12 +96,7 @@ def bake_subject(
 
 @explain_missing_packages()
 def write_take(capture: Capture, tracks: Tracks, folder: Path) -> list[Path]:
-    """Write the cameras and the captured head motion to the rig's folder; return the files written.
-
-    Raises:
-        CalibrationError: a camera of the capture has no calibration.
-        RigError, OutputError: the take cannot be written.
-    """
+    """Write the cameras and the captured head motion to the rig's folder; return the files written."""
     from jawusd.rig.cameras import write_cameras
 
     return write_cameras(
@@ -147,18 +138,15 @@ def joint_deltas(rig: JawRig, skin: Skin | None = None) -> list[JointDelta]:
     d = rig.project(wanted)
     joint = joint_poses(rig, d)
     moved, turned = joint[1:, :3, 3] - joint[0, :3, 3], joint[1:, :3, :3] @ joint[0, :3, :3].T
-    clamped = np.linalg.norm(d - wanted, axis=1)[1:]
-    return [
-        JointDelta(SHAPES[i], weight, *rest)
-        for (i, weight), *rest in zip(cases, d[1:], moved, turned, clamped.tolist(), strict=True)
-    ]
+    clamped = np.linalg.norm(d - wanted, axis=1)[1:].tolist()
+    rows = zip(cases, d[1:], moved, turned, clamped, strict=True)
+    return [JointDelta(SHAPES[i], weight, *rest) for (i, weight), *rest in rows]
 
 
 def _face_at_rest(skin: Skin) -> tuple[Array, list[int]]:
     """Return the median columns (K,) of the training frames nearest to the closed bite, and where the jaw weights are.
 
-    Raises:
-        FittingError: a jaw weight is not among the columns.
+    Raises FittingError if a jaw weight is not among the columns.
     """
     names = [name.lower() for name in skin.names]
     if missing := [shape for shape, column in zip(SHAPES, JAW_COLUMNS, strict=True) if column not in names]:

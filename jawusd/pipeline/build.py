@@ -48,52 +48,31 @@ OLD_MASKS = "masks"  # folder to which version 0.1 wrote masks if the capture na
 
 @dataclass(frozen=True)
 class BuildOptions:
-    """Options of a build.
+    """Options of a build."""
 
-    Attributes:
-        model: "anchored", "additive", "paper" or "pca".
-        solver: "contour" or "paper".
-        backend: renderer of the paper's solver, "cpu" or "gl".
-        jobs: number of threads of the tracker; the result does not depend on it.
-        resume: continue an earlier build in the folder.
-        fresh: delete an earlier build in the folder first.
-        allow_outside: allow paths in the capture that point outside its folder.
-        prim_name: name of the actor's prim; None: derived from the name of the capture.
-        command: command line of the build, recorded in the report.
-    """
-
-    model: str = "anchored"
-    solver: str = "contour"
-    backend: str = "cpu"
-    jobs: int = 2
-    resume: bool = False
-    fresh: bool = False
-    allow_outside: bool = False
-    prim_name: str | None = None
-    command: str = ""
+    model: str = "anchored"  # "anchored", "additive", "paper" or "pca"
+    solver: str = "contour"  # "contour" or "paper"
+    backend: str = "cpu"  # renderer of the paper's solver, "cpu" or "gl"
+    jobs: int = 2  # number of threads of the tracker; the result does not depend on it
+    resume: bool = False  # continue an earlier build in the folder
+    fresh: bool = False  # delete an earlier build in the folder first
+    allow_outside: bool = False  # allow paths in the capture that point outside its folder
+    prim_name: str | None = None  # name of the actor's prim; None: derived from the name of the capture
+    command: str = ""  # command line of the build, recorded in the report
 
 
 class BuildSummary(TypedDict):
-    """The result of a build.
-
-    Attributes:
-        files: names of all files written, relative to the folder.
-        seconds: duration of each stage [s]; for a reused stage, the duration of its last run.
-        reused: stages reused from an earlier build.
-        findings: the findings of the check before the first stage, as `Finding.as_json`.
-        calibrate: summary of the calibration; None if the capture names a calibration file.
-        track: summary of the final tracks.
-    """
+    """The result of a build."""
 
     capture: str
     folder: str
-    files: list[str]
-    seconds: dict[str, float]
-    reused: list[str]
-    findings: list[FoundJson]
-    calibrate: CalibrationSummary | None
+    files: list[str]  # names of all files written, relative to the folder
+    seconds: dict[str, float]  # duration of each stage [s]; for a reused stage, the duration of its last run
+    reused: list[str]  # stages reused from an earlier build
+    findings: list[FoundJson]  # the findings of the check before the first stage, as `Finding.as_json`
+    calibrate: CalibrationSummary | None  # summary of the calibration; None if the capture names a calibration file
     sync: SyncResult
-    track: TrackSummary
+    track: TrackSummary  # summary of the final tracks
     fit: FitSummary
     report: ReportSummary
 
@@ -122,7 +101,6 @@ def build(
     Args:
         capture: the capture, its capture.toml or the folder of that file.
         out: the rig's folder.
-        progress: called with (stage, done, total) as work proceeds.
         tell: called with every finding of the capture's check, before any work.
 
     Raises:
@@ -143,8 +121,7 @@ def build(
 def run_stages(run: Workspace, options: BuildOptions, tell: Callable[[Finding], None] | None) -> BuildSummary:
     """Run the stages of a build in order, or reuse them.
 
-    Each stage is declared with the parts of the capture and the settings that it depends on. File contents are hashed,
-    but not paths, so that a capture may be moved; the report alone depends on its path, which it records.
+    Contents of files are hashed, but not paths, so that a capture may be moved; only the report depends on its path.
     """
     capture, videos = run.capture, run.hashes(["videos"])
     names = [camera.name for camera in capture.cameras]

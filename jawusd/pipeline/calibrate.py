@@ -31,13 +31,13 @@ _SIZE_SIGMA = 0.005  # standard deviation of the scale factor estimated from mas
 
 
 class CameraReport(TypedDict):
-    """Quality of the calibration of one camera; `blurred` and `missed` list image numbers."""
+    """Quality of the calibration of one camera."""
 
     views: int
     rms_px: float
     coverage: float
-    blurred: list[int]
-    missed: list[int]
+    blurred: list[int]  # image numbers
+    missed: list[int]  # image numbers
 
 
 class CalibrationSummary(TypedDict):
@@ -92,11 +92,7 @@ def calibrate_boards(capture: Capture, out: Path, progress: Progress) -> Calibra
 def _scale_by_masks(
     capture: Capture, meshes: Mapping[str, Mesh], cameras: list[Camera], by_picks: ScaleCheck, progress: Progress
 ) -> ScaleCheck:
-    """Return the scale of the teeth estimated from the masks, to verify the stated size of the calibration board.
-
-    Raises:
-        CalibrationError: the scale contradicts the scans.
-    """
+    """Return the scale of the teeth estimated from the masks, to verify the stated size of the calibration board."""
     from jawusd.capture.scale import ScaleCheck, checked_scale
     from jawusd.tracking.initialization.scale_search import seen_size
 
@@ -125,8 +121,6 @@ def sync_cameras(capture: Capture, progress: Progress) -> SyncResult:
     if capture.sync.offsets is not None:
         result = SyncResult(offsets=dict(capture.sync.offsets), method="given in the capture")
     elif len(capture.cameras) == 1 or any(camera.video is None for camera in capture.cameras):
-        # Masks do not show flashes, so frames with equal numbers are assumed to be simultaneous; the report states
-        # this.
         result = SyncResult(offsets={camera.name: 0 for camera in capture.cameras}, method="taken as simultaneous")
     else:
         from jawusd.capture.sync import estimate_offsets
@@ -139,15 +133,7 @@ def sync_cameras(capture: Capture, progress: Progress) -> SyncResult:
 
 @explain_missing_packages()
 def sync_videos(videos: Mapping[str, Path | ClipSource], reference: str, progress: Progress) -> SyncResult:
-    """Return the frame offset of every clip relative to the reference clip, as `sync_cameras` does for a capture.
-
-    Args:
-        videos: clips by the names of their cameras.
-        reference: the camera to which the other cameras are aligned.
-
-    Raises:
-        SyncError, CaptureError: see `capture.sync.align_videos`.
-    """
+    """Return the frame offset of every camera's clip relative to the reference; see `capture.sync.align_videos`."""
     from jawusd.capture.sync import align_videos
 
     progress("sync", 0, 1)
@@ -157,6 +143,7 @@ def sync_videos(videos: Mapping[str, Path | ClipSource], reference: str, progres
 
 
 def _sync_result(alignment: Alignment) -> SyncResult:
+    """Return an alignment as plain data."""
     return SyncResult(
         offsets=alignment.offsets,
         reference=alignment.reference,
@@ -169,11 +156,7 @@ def _sync_result(alignment: Alignment) -> SyncResult:
 
 @explain_missing_packages()
 def light_curves(videos: Mapping[str, Path | ClipSource], progress: Progress) -> dict[str, LightCurve]:
-    """Return the mean brightness of every image by camera; all videos are decoded.
-
-    Raises:
-        CaptureError: a video cannot be read.
-    """
+    """Return the mean brightness of every image by camera; raises CaptureError if a video cannot be decoded."""
     from jawusd.capture.sync import light_curve
 
     found: dict[str, LightCurve] = {}
@@ -185,11 +168,7 @@ def light_curves(videos: Mapping[str, Path | ClipSource], progress: Progress) ->
 
 
 def write_light_curves(path: Path, curves: Mapping[str, LightCurve]) -> None:
-    """Write the mean brightness of every image as CSV: camera, image, time_s, brightness.
-
-    Raises:
-        OutputError: the file cannot be written.
-    """
+    """Write the mean brightness of every image as CSV: camera, image, time_s, brightness."""
     lines = ["camera,picture,time_s,brightness"]
     for name, curve in curves.items():
         pictures = enumerate(zip(curve.times_s, curve.brightness))
@@ -199,10 +178,7 @@ def write_light_curves(path: Path, curves: Mapping[str, LightCurve]) -> None:
 
 @explain_missing_packages()
 def write_sync_plot(path: Path, curves: Mapping[str, LightCurve], result: SyncResult | None) -> None:
-    """Draw the brightness of all clips before and after alignment, as .png or .svg.
-
-    Args:
-        result: offsets found; None if the cameras could not be aligned.
+    """Draw the brightness of all clips before and, if they could be aligned, after alignment, as .png or .svg.
 
     Raises:
         OutputError: the file cannot be written.

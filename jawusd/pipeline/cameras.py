@@ -31,10 +31,8 @@ def read_calibration(path: Path, unit_mm: float, sizes: Callable[[], Mapping[str
     """Read cameras from any supported file, including OpenUSD stages; the returned lengths are in mm.
 
     Args:
-        path: the file or folder.
         unit_mm: the file's unit of length [mm]; ignored for stages, which state their own unit.
-        sizes: callback that returns the image size (width, height) [px] of each camera; used if the file does not state
-            it.
+        sizes: returns the image size (width, height) [px] of each camera; used if the file does not state it.
 
     Raises:
         CalibrationError, FormatError, RigError: the file contains no valid cameras.
@@ -49,16 +47,14 @@ def read_calibration(path: Path, unit_mm: float, sizes: Callable[[], Mapping[str
 class SameSize(dict[str, Size]):
     """A mapping that returns the same image size for every camera name."""
 
-    def __init__(self, size: Size | None) -> None:
+    def __init__(self, size: Size) -> None:
         super().__init__()
         self._size = size
 
     def __contains__(self, name: object) -> bool:
-        return self._size is not None
+        return True
 
     def __missing__(self, name: str) -> Size:
-        if self._size is None:
-            raise KeyError(name)
         return self._size
 
 
@@ -67,7 +63,6 @@ def convert_cameras(source: Path, out: Path, unit_mm: float, size: Size | None) 
 
     Args:
         source: a camera file as for `cameras.files.load_cameras_file`, or a stage.
-        out: file or folder to write.
         unit_mm: the source's unit of length [mm].
         size: (width, height) [px] of the images, for formats that do not state it.
 
@@ -76,7 +71,7 @@ def convert_cameras(source: Path, out: Path, unit_mm: float, size: Size | None) 
             represent them.
         OutputError: the file cannot be written, or has an unsupported suffix.
     """
-    cameras = read_calibration(source, unit_mm, lambda: SameSize(size))
+    cameras = read_calibration(source, unit_mm, lambda: {} if size is None else SameSize(size))
     suffix = out.suffix.lower()
     if suffix == ".toml":
         save_calibration(out, cameras)
@@ -86,11 +81,8 @@ def convert_cameras(source: Path, out: Path, unit_mm: float, size: Size | None) 
 
         return cameras, [write_camera_stage(out, cameras)]
     if suffix:
-        raise OutputError(
-            f'cannot write "{suffix}" files.',
-            path=out,
-            hint="Give a .toml (aniposelib), a .usda, or a folder (COLMAP).",
-        )
+        hint = "Give a .toml (aniposelib), a .usda, or a folder (COLMAP)."
+        raise OutputError(f'cannot write "{suffix}" files.', path=out, hint=hint)
     return cameras, save_colmap(out, cameras)
 
 
@@ -109,15 +101,9 @@ def load_cameras(capture: Capture) -> list[Camera]:
 
 
 def rescaled_cameras(capture: Capture) -> dict[str, tuple[Size, Size]]:
-    """Return, by camera name, the calibrated and the recorded size (width, height) [px] where they differ.
-
-    Raises:
-        CalibrationError, CaptureError: see `load_cameras`.
-    """
-    sizes = {
-        camera.name: (_size(camera), _size(recorded))
-        for (camera, _), recorded in zip(_calibrated(capture), load_cameras(capture), strict=True)
-    }
+    """Return, by name, the calibrated and the recorded size [px] where they differ; raises like `load_cameras`."""
+    pairs = zip(_calibrated(capture), load_cameras(capture), strict=True)
+    sizes = {camera.name: (_size(camera), _size(recorded)) for (camera, _), recorded in pairs}
     return {name: (was, now) for name, (was, now) in sizes.items() if was != now}
 
 
@@ -209,10 +195,7 @@ def open_videos(capture: Capture) -> dict[str, Clip]:
 
 
 def open_footage(capture: Capture, tracks: Tracks | None = None) -> tuple[dict[str, Camera], dict[str, Clip]]:
-    """Return the calibrated cameras of a capture, and the videos of cameras that have one, by camera name.
-
-    Args:
-        tracks: apply the camera corrections of these tracks.
+    """Return the calibrated cameras, corrected as in tracks if these are given, and the videos, by camera name.
 
     Raises:
         CaptureError: no camera has a video, or one cannot be decoded.
@@ -230,7 +213,7 @@ def open_colour_footage(
 
     Args:
         offsets: frame offset by camera.
-        work: name of the task, for messages, if the task needs at least two cameras.
+        work: name of a task that needs at least two cameras.
 
     Raises:
         CaptureError, CalibrationError: see `open_footage`; or fewer than two cameras have a video.
@@ -250,9 +233,6 @@ def open_colour_footage(
 def open_backdrops(capture: Capture, offsets: Mapping[str, int]) -> dict[str, Backdrop]:
     """Return, by camera, the images over which scans are drawn: footage or, without footage, masks.
 
-    Args:
-        offsets: frame offset by camera.
-
     Raises:
         CaptureError: no camera has video or masks, or one cannot be decoded.
     """
@@ -269,11 +249,7 @@ def open_backdrops(capture: Capture, offsets: Mapping[str, int]) -> dict[str, Ba
 
 
 def check_same_cameras(capture: Capture, tracks: Tracks) -> None:
-    """Check that a capture has all cameras that the tracks use; additional cameras are allowed.
-
-    Raises:
-        FormatError: the capture lacks a camera.
-    """
+    """Raise FormatError if a capture lacks a camera that the tracks use."""
     names = [camera.name for camera in capture.cameras]
     if not set(tracks.camera_names) <= set(names):
         raise FormatError(
@@ -282,10 +258,6 @@ def check_same_cameras(capture: Capture, tracks: Tracks) -> None:
 
 
 def tracked_scans(capture: Capture, tracks: Tracks) -> tuple[Mesh, Mesh]:
-    """Return the upper and the lower scan [mm] in the registration to which the poses of the tracks refer.
-
-    Raises:
-        CaptureError, FormatError: see `load_meshes`.
-    """
+    """Return the upper and the lower scan [mm] in the registration of the tracks; raises like `load_meshes`."""
     meshes = registered_meshes(load_meshes(capture), tracks.meta)
     return meshes["upper_teeth"], meshes["lower_teeth"]

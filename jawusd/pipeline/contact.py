@@ -38,9 +38,6 @@ class ContactSummary(TypedDict, total=False):
 def contact_pictures(model: JawModel, subject: Subject) -> tuple[ContactPicture, ...]:
     """Draw the tooth contacts with the teeth closed, and halfway through protrusion and both laterotrusions.
 
-    Args:
-        subject: the subject; its scans must be in the registration to which the model's poses refer.
-
     Raises:
         RigError: tooth contact cannot be computed from the scans.
     """
@@ -72,23 +69,18 @@ def teeth_of(rig: JawRig, meshes: Mapping[str, Mesh]) -> Teeth:
     Raises:
         RigError: the rig has no clearances, or tooth contact cannot be computed from the meshes.
     """
-    from jawusd.meshes.contact import NoContact, find_teeth
-
-    missing = [name for name in TEETH.values() if name not in meshes]
-    if rig.contact is None or missing:
+    if rig.contact is None or any(name not in meshes for name in TEETH.values()):
         raise RigError("has no tooth contact data.", hint="Fit it with scans of both arches in occlusion.")
-    upper, lower = (meshes[TEETH[row]] for row in ("upper", "lower"))
-    try:
-        return find_teeth(upper, lower, rig.T_anatomical_skull, rig.T_rest)
-    except NoContact as reason:
-        raise RigError(f"does not allow tooth contact to be computed: {reason}.") from reason
+    teeth = tooth_solids(meshes, rig.T_anatomical_skull, rig.T_rest)
+    if isinstance(teeth, str):
+        raise RigError(f"does not allow tooth contact to be computed: {teeth}.")
+    return teeth
 
 
 def tooth_solids(meshes: Mapping[str, Mesh], T_anatomical_skull: Array, T_rest: Array) -> Teeth | str:
-    """Return both arches as solids, or the reason why that failed; axes and rest pose are as in `Subject`.
+    """Return both arches as solids, or the reason why that failed.
 
-    Args:
-        meshes: scans and bones, in the registration to which the poses refer.
+    The meshes are in the registration to which the poses refer; axes and rest pose are as in `Subject`.
     """
     from jawusd.meshes.contact import NoContact, find_teeth
 
@@ -118,48 +110,42 @@ def condyle_solids(
 def with_tooth_contact(
     model: JawModel, teeth: Teeth | str, progress: Progress = no_progress, *, regauge: bool = True
 ) -> JawModel:
-    """Return the model with tooth clearances added; ``meta["contact"]`` summarises them.
+    """Return the model with clearances of `tooth_solids` added; ``meta["contact"]`` summarises them.
 
-    Args:
-        teeth: result of `tooth_solids`.
-        regauge: shift d1 so that the teeth touch at d1 = 0, and end the bound there.
+    With `regauge`, d1 is shifted so that the teeth touch at d1 = 0, where the bound then ends.
     """
     from jawusd.fitting.glide import follow_teeth
     from jawusd.meshes.contact import sample_field
 
     if isinstance(teeth, str):
-        return _known(model, "contact", {"missing": teeth})
+        return _with_reason(model, "contact", teeth)
     progress("contact", 0, 3)
     if regauge:
         model = follow_teeth(model, teeth)
     progress("contact", 1, 3)
     field = sample_field(teeth, JawRig(model.arrays, model.meta))
     progress("contact", 2, 3)
-    return replace(_known(model, "contact", _summary(field)), arrays={**model.arrays, **field.arrays("teeth")})
+    return _with_field(model, "contact", field, field.arrays("teeth"))
 
 
 def with_condyle_contact(model: JawModel, joints: Joints | str, progress: Progress = no_progress) -> JawModel:
-    """Return the model with condyle clearances added; ``meta["joints"]`` summarises them.
-
-    Args:
-        joints: result of `condyle_solids`.
-    """
+    """Return the model with clearances of `condyle_solids` added; ``meta["joints"]`` summarises them."""
     from jawusd.meshes.contact import sample_field
     from jawusd.meshes.joints import STEP_MM
 
     if isinstance(joints, str):
-        model = _known(model, "joints", {"missing": joints})
+        model = _with_reason(model, "joints", joints)
     else:
         field = sample_field(joints, JawRig(model.arrays, model.meta), STEP_MM, np.inf)
-        known, clearances = _known(model, "joints", _summary(field)), field.arrays("condyles")
-        model = replace(known, arrays={**model.arrays, **clearances})
+        model = _with_field(model, "joints", field, field.arrays("condyles"))
     progress("contact", 3, 3)
     return model
 
 
-def _known(model: JawModel, name: str, found: ContactSummary) -> JawModel:
-    return replace(model, meta={**model.meta, name: found})
+def _with_reason(model: JawModel, name: str, reason: str) -> JawModel:
+    return replace(model, meta={**model.meta, name: ContactSummary(missing=reason)})
 
 
-def _summary(field: ContactField) -> ContactSummary:
-    return {"closed_mm": field.closed_mm, "error_mm": field.error_mm, "limit_mm": field.limit_mm}
+def _with_field(model: JawModel, name: str, field: ContactField, arrays: dict[str, Array]) -> JawModel:
+    found = ContactSummary(closed_mm=field.closed_mm, error_mm=field.error_mm, limit_mm=field.limit_mm)
+    return replace(model, meta={**model.meta, name: found}, arrays={**model.arrays, **arrays})

@@ -1,12 +1,11 @@
 """Fit a jaw model to tracks, or to poses and markers from other programs, converted to T_skull_mandible [mm].
 
-Poses from jaw-tracking-system (PyPI `jaw-tracking-system`, Mueller et al.), an optical marker system, are HDF5 files.
-Layout, as its `store_transformations` writes it (version 1.1): one group per trajectory, by default
-`T_model_origin_mand_landmark_t` and, smoothed, `T_model_origin_mand_landmark_t_smooth`, with the data sets
-`translations` (N, 3) and `rotations`, scalar-first quaternions (N, 4) or matrices (N, 3, 3), and the attributes `unit`
-("mm" or "m", of the translations) and `sample_rate` [Hz]. Files cut by its `split_hdf5_by_sub_experiments` add
-`transformations` (N, 4, 4) and write their `rotations` scalar-last, so `transformations` takes precedence. A
-trajectory maps the frame of mandibular landmarks, digitised on the teeth, to the frame of the upper model.
+Poses from jaw-tracking-system (PyPI `jaw-tracking-system`, Mueller et al., version 1.1) are HDF5 files: one group per
+trajectory, by default `T_model_origin_mand_landmark_t` and, smoothed, `T_model_origin_mand_landmark_t_smooth`, with the
+data sets `translations` (N, 3) and `rotations`, scalar-first quaternions (N, 4) or matrices (N, 3, 3), and the
+attributes `unit` ("mm" or "m") and `sample_rate` [Hz]. Files cut by its `split_hdf5_by_sub_experiments` write their
+`rotations` scalar-last and add `transformations` (N, 4, 4), which therefore take precedence. A trajectory maps the
+frame of landmarks digitised on the mandible to the frame of the upper model.
 """
 
 from __future__ import annotations
@@ -57,15 +56,14 @@ _MOST_NUMBERS = 16_000_000  # maximum number of array elements: a million 4 x 4 
 class TrajectoryOptions:
     """Conventions of a pose file: names, units and direction of its transforms."""
 
-    # for tables, maps jawusd's column names to the file's; see `formats.poses.read_poses`
+    #: for tables, maps jawusd's column names to the file's; see `formats.poses.read_poses`
     columns: Mapping[str, str] = field(default_factory=dict)
     length_unit: str = "mm"  # a key of `LENGTH_UNITS_MM`, for files that do not state their unit
     invert: bool = False  # whether the transforms of the file map the skull frame to the mandible frame
-    # video frame with the teeth in occlusion; poses are made relative to it, so that the file may use any coordinate
-    # frame of the mandible; None: the file's pose in occlusion is the identity
+    #: frame with the teeth in occlusion, to which poses are made relative; None: they are relative to occlusion
     rest_frame: int | None = None
     group: str | None = None  # name of the trajectory in an HDF5 file; None: the raw trajectory
-    # rigid bodies in a table of markers (see `pipeline.markers.marker_poses`); empty if the file contains poses
+    #: rigid bodies in a table of markers (see `pipeline.markers.marker_poses`); empty if the file contains poses
     rigid: Mapping[str, str] = field(default_factory=dict)
 
 
@@ -141,18 +139,17 @@ def fit_summary(model: JawModel) -> FitSummary:
 
 
 def read_motion(
-    path: str | os.PathLike[str], options: TrajectoryOptions | None = None
+    path: str | os.PathLike[str], options: TrajectoryOptions = TrajectoryOptions()
 ) -> tuple[Tracks | Poses, float | None]:
     """Read tracks from tracks.npz, or poses and their frame rate from any other file; see `read_trajectory`.
 
     Raises:
-        FormatError: the file is invalid, or it is tracks.npz, for which options do not apply.
-        MissingDependencyError: the file is HDF5, and h5py is not installed.
+        FormatError: also if options are given for tracks.npz.
     """
     if Path(path).suffix != ".npz":
-        frames, T, fps = read_trajectory(path, options or TrajectoryOptions())
+        frames, T, fps = read_trajectory(path, options)
         return (frames, T), fps
-    if options not in (None, TrajectoryOptions()):
+    if options != TrajectoryOptions():
         raise FormatError("contains tracks; columns, units and rest frame apply only to other poses.", path=path)
     return load_tracks(path), None
 
@@ -225,7 +222,9 @@ def read_hdf5(path: str | os.PathLike[str], group: str | None = None) -> Poses:
             inside = [name for name in file if isinstance(file.get(name, getlink=True), h5py.HardLink)]
             groups = [name for name in inside if isinstance(file[name], h5py.Group) and "translations" in file[name]]
             name = _chosen(groups, group, path)
-            held = {key: _data(file[name], key, name, path) for key in ("translations", "rotations", "transformations")}
+            t, rotations, whole = (
+                _data(file[name], key, name, path) for key in ("translations", "rotations", "transformations")
+            )
             unit = file[name].attrs.get("unit", "mm")
     # h5py raises exceptions of many types for corrupt files.
     except (OSError, RuntimeError, LookupError, ValueError, TypeError, AttributeError, MemoryError) as error:
@@ -233,9 +232,17 @@ def read_hdf5(path: str | os.PathLike[str], group: str | None = None) -> Poses:
     unit = unit.decode(errors="replace") if isinstance(unit, bytes) else str(unit)
     if unit not in _HDF5_UNITS_MM:
         raise FormatError(f'group "{name}": unit is "{unit}"; must be one of {", ".join(_HDF5_UNITS_MM)}.', path=path)
-    T = _poses(held, name, path)
+    T = _poses(t, rotations, whole, name, path)
     T[:, :3, 3] *= _HDF5_UNITS_MM[unit]
-    return np.arange(len(T)), _checked(T, name, path)
+    T[~np.isfinite(T).all((1, 2))] = np.nan
+    defect = rigidity_defect(np.where(np.isfinite(T), T, np.eye(4)))
+    if len(T) and defect.max() > _RIGID_TOLERANCE:
+        raise FormatError(
+            f'group "{name}", row {int(defect.argmax()) + 1}: the pose is not rigid (deviation {defect.max():.2g}; '
+            f"at most {_RIGID_TOLERANCE:g} is allowed).",
+            path=path,
+        )
+    return np.arange(len(T)), T
 
 
 def _chosen(groups: list[str], wanted: str | None, path: Path) -> str:
@@ -267,9 +274,8 @@ def _data(group: h5py.Group, key: str, name: str, path: Path) -> Array | None:
     return np.asarray(held[()], dtype=np.float64)
 
 
-def _poses(held: dict[str, Array | None], name: str, path: Path) -> Array:
+def _poses(t: Array | None, rotations: Array | None, whole: Array | None, name: str, path: Path) -> Array:
     """Return the poses (F, 4, 4) from the data sets of a trajectory; translations are in the file's unit."""
-    whole, t, rotations = held["transformations"], held["translations"], held["rotations"]
     if whole is not None:
         if whole.ndim != 3 or whole.shape[1:] != (4, 4):
             raise FormatError(f'group "{name}": "transformations" has shape {whole.shape}, not (N, 4, 4).', path=path)
@@ -290,17 +296,3 @@ def _poses(held: dict[str, Array | None], name: str, path: Path) -> Array:
     if (norm < 1e-6).any():
         raise FormatError(f'group "{name}", row {int(norm.argmin()) + 1}: the quaternion is zero.', path=path)
     return make_transform(matrix_from_wxyz(rotations), t)
-
-
-def _checked(T: Array, name: str, path: Path) -> Array:
-    T[~np.isfinite(T).all((1, 2))] = np.nan
-    present = np.flatnonzero(np.isfinite(T[:, 0, 0]))
-    defect = rigidity_defect(T[present])
-    if defect.size and defect.max() > _RIGID_TOLERANCE:
-        row = int(present[defect.argmax()])
-        raise FormatError(
-            f'group "{name}", row {row + 1}: the pose is not rigid (deviation {defect.max():.2g}; '
-            f"at most {_RIGID_TOLERANCE:g} is allowed).",
-            path=path,
-        )
-    return T

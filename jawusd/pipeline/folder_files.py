@@ -134,9 +134,7 @@ def _paired(paths: Sequence[PurePath]) -> dict[PurePath, str]:
 def _part(path: PurePath, paired: str) -> str:
     """Return the key of [scans] for a mesh, "" if unknown; words of the file name take precedence over folder names.
 
-    Args:
-        path: the mesh.
-        paired: arch of the mesh according to an ambiguous word (see `_paired`); "" if unknown.
+    `paired` is the arch according to an ambiguous word (see `_paired`), "" if unknown.
     """
     own, all_words = set(_split_words(PurePath(path.name))), set(_split_words(path))
     for own_words, arch in ((own, ""), (all_words, ""), (all_words, paired)):
@@ -158,13 +156,12 @@ def _part(path: PurePath, paired: str) -> str:
 
 def camera_names(paths: Sequence[PurePath]) -> dict[PurePath, str]:
     """Return a unique name for each clip, made of the words in which its path differs from the other paths."""
-    own_words = {path: [word for word in words(path)] for path in paths}
+    own_words = {path: words(path) for path in paths}
     shared = set.intersection(*(set(own) for own in own_words.values())) if len(own_words) > 1 else set()
     out: dict[PurePath, str] = {}
     for path, own in own_words.items():
-        telling = [word for word in own if word not in shared | _BOARD | _GENERIC]
-        unique = list(dict.fromkeys(telling))
-        out[path] = "_".join(unique) or "_".join(words(PurePath(path.name))) or "camera"
+        telling = dict.fromkeys(word for word in own if word not in shared | _BOARD | _GENERIC)
+        out[path] = "_".join(telling) or "_".join(words(PurePath(path.name))) or "camera"
     stems = [PurePath(path.name).stem for path in paths]
     plain = [re.sub(r"[^A-Za-z0-9_\-]+", "_", re.sub(r"%0?\d*d", "", stem)).strip("_.-") for stem in stems]
     if len(set(out.values())) < len(paths) or any(len(name) > 40 for name in out.values()):
@@ -175,21 +172,14 @@ def camera_names(paths: Sequence[PurePath]) -> dict[PurePath, str]:
 
 
 def pair(names: Mapping[PurePath, str], others: Sequence[PurePath]) -> tuple[dict[PurePath, PurePath], bool]:
-    """Match files, such as masks, to clips; the returned flag is true for matches by name, false for matches by order.
-
-    Args:
-        names: camera names by clip.
-        others: files to match, each of which belongs to one camera.
-    """
+    """Match files of one camera each to clips with camera names; also return whether names, not the order, match."""
     found: dict[PurePath, PurePath] = {}
     for clip, name in names.items():
         telling = set(words(PurePath(name)))
         fits = [other for other in others if telling <= set(words(other))]
         if len(fits) == 1 and fits[0] not in found.values():
             found[clip] = fits[0]
-    if len(found) == len(names):
-        return found, True
-    if not found and len(others) == len(names):
+    if names and not found and len(others) == len(names):
         return dict(zip(names, others)), False
     return found, True
 

@@ -5,12 +5,13 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import cast
 
 import numpy as np
+from numpy.typing import NDArray
 
 from jawusd.base.arrays import Array, Mask
 from jawusd.base.errors import EvaluatorError, FormatError, OutputError, explain_missing_packages
@@ -35,12 +36,7 @@ _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 
 @explain_missing_packages()
 def load_any_rig(path: Path) -> JawRig:
-    """Read a rig from `model.npz`, which needs only numpy, or from any USD layer that contains it.
-
-    Raises:
-        JawusdError: the file is not a rig.
-        MissingDependencyError: the file is USD, and OpenUSD is not installed.
-    """
+    """Read a rig from `model.npz`, which needs only numpy, or from any USD layer that contains it."""
     if path.suffix == ".npz":
         return load(path)
     from jawusd.rig import load_rig
@@ -54,11 +50,7 @@ def open_library(folder: str | os.PathLike[str]) -> Library:
 
 
 def add_rig(folder: str | os.PathLike[str], source: Path, name: str | None, force: bool) -> Path:
-    """Copy a rig into a library, as the model file `NAME/model.npz`, and return that file.
-
-    Args:
-        name: name of the subject and of its subfolder; None: the name in the rig.
-        force: overwrite a subject of the same name.
+    """Copy a rig into a library, as the model file `NAME/model.npz` (default: the name in the rig); return that file.
 
     Raises:
         FormatError: the file is not a rig, or the name is not a valid folder name.
@@ -86,21 +78,18 @@ def _as_model(rig: JawRig, source: Path, name: str) -> JawModel:
         model = load_model(source)
         model.meta["actor"] = name
         return model
-    none = np.zeros(0)
     arrays = {key: np.array(value) for key, value in rig.arrays.items()}
-    return JawModel(
-        arrays, none.astype(np.int64), np.zeros((0, 3)), none, none.astype(bool), {**rig.meta, "actor": name}
-    )
+    return JawModel(arrays, *_no_frames(), {**rig.meta, "actor": name})
+
+
+def _no_frames() -> tuple[NDArray[np.int64], Array, Array, Mask]:
+    """Return frames, d, residuals and training mask of a model without a take."""
+    return np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros(0), np.zeros(0, bool)
 
 
 @explain_missing_packages()
 def plot_ranges(entries: Sequence[Entry], folder: Path, force: bool) -> list[Path]:
-    """Plot the ranges of motion of a library's subjects side by side, as PNG and SVG; return the files.
-
-    Raises:
-        MissingDependencyError: matplotlib is not installed.
-        OutputError: a file exists already, or cannot be written.
-    """
+    """Plot the ranges of motion of a library's subjects side by side, as PNG and SVG; return the files."""
     from jawusd.report.figures import RANGES, draw_ranges
 
     for suffix in (".png", ".svg"):
@@ -140,18 +129,12 @@ def personal_rig(landmarks: Path, library: Library, *, closest: bool, name: str,
     progress("carry", 1, 1)
     model = fit_personal(subject, motion, progress)
     left_out = tuple(entry.path for entry in library.entries if entry.not_shown)
-    return PersonalRig(
-        model, motion, left_out, cast("Mapping[str, object]", model.meta["personal"])
-    )  # `fit_personal` sets this entry
+    return PersonalRig(model, motion, left_out, cast("Mapping[str, object]", model.meta["personal"]))
 
 
 @explain_missing_packages()
 def fit_personal(subject: Subject, motion: PersonalMotion, progress: Progress) -> JawModel:
-    """Fit the anchored model to motion transferred to a subject, and store the expected error in the model's header.
-
-    Raises:
-        FittingError: see `fitting.fit_model`.
-    """
+    """Fit the anchored model to motion transferred to a subject, and store the expected error in the model's header."""
     from jawusd.fitting import FittingConfig, fit_model
 
     model = fit_model(
@@ -163,10 +146,10 @@ def fit_personal(subject: Subject, motion: PersonalMotion, progress: Progress) -
         progress=partial(progress, "fit"),
     )
     model.meta["inferred"] = list(subject.inferred)
-    expected = motion.learned.expected
+    expected, scale_mm = motion.learned.expected, motion.learned.bandwidth_mm
     model.meta["personal"] = {
         "weights": motion.weights,
-        "landmark_distance_scale_mm": _finite(motion.learned.bandwidth_mm),
+        "landmark_distance_scale_mm": None if scale_mm is None or not np.isfinite(scale_mm) else scale_mm,
         "expected_error_mm": None if expected is None else expected.summary(),
         "fit_to_carried_motion_mm": model.meta["errors"],
     }
@@ -179,9 +162,7 @@ def fit_personal(subject: Subject, motion: PersonalMotion, progress: Progress) -
         model.arrays["residual_limit_mm"] = limit
     # Transferred poses are not a take of this subject, so the file gets no captured motion and no held-out frames.
     arrays = {name: value for name, value in model.arrays.items() if name not in HELD_OUT_ARRAYS}
-    none = np.zeros(0)
-    d, trained = np.zeros((0, 3)), none.astype(bool)
-    return replace(model, arrays=arrays, frames=none.astype(np.int64), d=d, residual_mm=none, trained=trained)
+    return JawModel(arrays, *_no_frames(), model.meta)
 
 
 def _caution(motion: PersonalMotion) -> str:
@@ -191,10 +172,6 @@ def _caution(motion: PersonalMotion) -> str:
         return f"{start} the expected error is unknown, because the library has a single subject."
     found = motion.learned.expected.summary()
     return f"{start} expected error {found['mean']:.2f} mm, 95 % below {found['p95']:.2f} mm (leave-one-out)."
-
-
-def _finite(value: float | None) -> float | None:
-    return None if value is None or not np.isfinite(value) else value
 
 
 @dataclass(frozen=True, eq=False)

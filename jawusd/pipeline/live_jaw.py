@@ -28,45 +28,27 @@ from jawusd.tracking.performance.skin import SkinFilter
 
 @dataclass(frozen=True, eq=False)
 class LiveJaw:
-    """The jaw in one frame.
+    """The jaw in one frame."""
 
-    Attributes:
-        d: jaw parameters [mm], shape (3,).
-        covariance: their covariance [mm^2], shape (3, 3).
-        state: solved, skin or carried.
-        familiar: as in `LiveFrame`.
-    """
-
-    d: Array
-    covariance: Array
-    state: SolveState
-    familiar: bool | None = None
+    d: Array  # jaw parameters [mm], shape (3,)
+    covariance: Array  # their covariance [mm^2], shape (3, 3)
+    state: SolveState  # solved, skin or carried
+    familiar: bool | None = None  # as in `LiveFrame`
 
 
 @dataclass(frozen=True, eq=False)
 class LiveFrame:
-    """Result of one frame, which consists of the images of all sources at one time.
+    """Result of one frame, which consists of the images of all sources at one time."""
 
-    Attributes:
-        time_s: capture time of the images [s] since the start of the sources; for files, since their first images.
-        d, sigma: jaw parameters and their standard deviations [mm], shape (3,).
-        margin_mm: signed distance to the rig's bound [mm], positive inside.
-        verdict: the rig's verdict on the pose.
-        state: name of the `SolveState`: solved, skin or carried.
-        latency_ms: time from the capture of the images to this result [ms].
-        dropped: number of frames dropped since the last result.
-        familiar: whether the face resembles those from which the map was learned; None without skin, or if the face
-            tracker has no row near this time.
-    """
-
-    time_s: float
-    d: Array
-    sigma: Array
-    margin_mm: float
-    verdict: str
-    state: str
-    latency_ms: float
-    dropped: int
+    time_s: float  # capture time of the images [s] since the start of the sources; for files, since their first images
+    d: Array  # jaw parameters [mm], shape (3,)
+    sigma: Array  # their standard deviations [mm], shape (3,)
+    margin_mm: float  # signed distance to the rig's bound [mm], positive inside
+    verdict: str  # the rig's verdict on the pose
+    state: str  # name of the `SolveState`: solved, skin or carried
+    latency_ms: float  # time from the capture of the images to this result [ms]
+    dropped: int  # number of frames dropped since the last result
+    #: whether the face resembles those from which the map was learned; None without skin or a row near this time
     familiar: bool | None = None
 
     def as_json(self) -> dict[str, object]:
@@ -105,8 +87,7 @@ class LiveSkin:
         """Read the map, and the face data if they are a recording; `recorded` is whether all cameras are files.
 
         Raises:
-            FormatError: a file is invalid, the map belongs to another subject, or a recording has other columns than
-                those of the map or no frame rate.
+            FormatError: see `load_own_skin` and `read_shot_face`.
         """
         self._skin, self._options = load_own_skin(rig, options.skin), options
         self._filter, self._agreed = SkinFilter(), deque[tuple[SkinJaw, Array]](maxlen=_COMPARED)
@@ -114,11 +95,7 @@ class LiveSkin:
         self._face: RecordedFace | FaceStream = (RecordedFace if whole else FaceStream)(self._skin, options)
 
     def play(self, begin_s: float, silence_s: float) -> None:
-        """Start a recording at `begin_s` on the live clock, or wait for the first row of a stream.
-
-        Raises:
-            FormatError: a stream has no row within `silence_s` [s], or an invalid one.
-        """
+        """Start a recording at `begin_s` on the live clock, or wait for the first row of a stream."""
         self._face.play(begin_s, silence_s)
 
     def stop(self) -> None:
@@ -134,8 +111,7 @@ class LiveSkin:
             seconds: time since the previous frame [s].
 
         Raises:
-            FormatError: a row of the face data is invalid, or has other columns than the map.
-            FittingError: skin and visible teeth disagree.
+            FormatError, FittingError: a row of the face data is invalid, or skin and visible teeth disagree.
         """
         columns = self._face.at(at_s)
         found, seen = self._skin(columns), jaw.state == SolveState.SOLVED
@@ -153,11 +129,7 @@ class RecordedFace:
     """The rows of a recorded face, played with recorded images."""
 
     def __init__(self, skin: Skin, options: SkinOptions) -> None:
-        """Read the recording.
-
-        Raises:
-            FormatError: the recording is invalid, has other columns than the map, or has no frame rate.
-        """
+        """Read the recording; raises like `read_shot_face`."""
         times_s, self._rows = read_shot_face(skin, options)
         self._times_s, self._begin_s = times_s + (options.offset_s or 0.0), 0.0
 
@@ -220,11 +192,7 @@ class FaceStream:
         self._stopped.set()
 
     def at(self, time_s: float) -> Array:
-        """Return the columns (K,) at a time of the live clock [s], waiting for the row after it; NaN where unknown.
-
-        Raises:
-            FormatError: a row is invalid, or has other columns than the map.
-        """
+        """Return the columns (K,) at a time of the live clock [s], waiting for the row after it; NaN where unknown."""
         with self._changed:
             left_s = max(0.0, time_s + _LATE_S - live_source.now_s())
             self._changed.wait_for(lambda: self._error or self._rows[-1][0] + self._offset_s() > time_s, left_s)

@@ -61,59 +61,36 @@ class _CancelledError(Exception):
 
 @dataclass(frozen=True)
 class ManyOptions:
-    """Options for building many captures.
+    """Options for building many captures."""
 
-    Attributes:
-        build: options for every build.
-        cluster: address of a Dask scheduler; None: local processes.
-        workers: number of local processes; None: one per core, at most one per capture.
-        retries: number of retries of a capture after its process died; an existing scheduler uses its own setting.
-    """
-
-    build: BuildOptions
-    cluster: str | None = None
-    workers: int | None = None
+    build: BuildOptions  # options for every build
+    cluster: str | None = None  # address of a Dask scheduler; None: local processes
+    workers: int | None = None  # number of local processes; None: one per core, at most one per capture
+    #: number of retries of a capture after its process died; an existing scheduler uses its own setting
     retries: int = 3
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """Outcome of one build.
+    """Outcome of one build."""
 
-    Attributes:
-        name: name of the output folder.
-        capture: path of the capture.
-        status: "built", "kept" (nothing changed since an earlier build), "failed" or "stopped".
-        frames, tracked: number of frames, and number of frames with both arches tracked.
-        model_mm: mean over frames of the maximum error over the mandible's vertices [mm].
-        holdout_mm: the same mean, over held-out frames [mm].
-        sigma_incisor_mm: median standard deviation of the tracked incisal point [mm].
-        seconds: total duration of the stages.
-        error: reason for the failure; None if the build did not fail.
-    """
-
-    name: str
-    capture: str
-    status: str
+    name: str  # name of the output folder
+    capture: str  # path of the capture
+    status: str  # "built", "kept" (nothing changed since an earlier build), "failed" or "stopped"
     frames: int | None = None
-    tracked: int | None = None
-    model_mm: float | None = None
-    holdout_mm: float | None = None
-    sigma_incisor_mm: float | None = None
-    seconds: float | None = None
-    error: str | None = None
+    tracked: int | None = None  # number of frames with both arches tracked
+    model_mm: float | None = None  # mean over frames of the maximum error over the mandible's vertices [mm]
+    holdout_mm: float | None = None  # the same mean, over held-out frames [mm]
+    sigma_incisor_mm: float | None = None  # median standard deviation of the tracked incisal point [mm]
+    seconds: float | None = None  # total duration of the stages
+    error: str | None = None  # reason for the failure; None if the build did not fail
 
 
 def build_many(captures: Sequence[ListedCapture], root: Path, options: ManyOptions, notify: Notify) -> list[Outcome]:
-    """Build the rig of every capture in its own folder; a failure does not stop the others.
+    """Build the rig of every capture in its own folder below `root`; a failure does not stop the others.
 
-    The table of outcomes is written to builds.json and builds.csv, even after an interrupt.
-
-    Args:
-        root: parent of the output folders; must have the same path on every worker.
-
-    Returns:
-        Outcomes in the order of the captures.
+    The outcomes, in the order of the captures, are written to builds.json and builds.csv, even after an interrupt.
+    `root` must have the same path on every worker.
 
     Raises:
         OutputError: an output folder contains a build and neither `resume` nor `fresh` is set, or cannot be created.
@@ -149,7 +126,9 @@ def _run(
     run = uuid.uuid4().hex
     # After a worker has died, the retry reuses the stages that the worker finished.
     options = options if options.fresh else replace(options, resume=True)
-    with _listening(client, run, notify):
+    with contextlib.ExitStack() as stack:
+        client.subscribe_topic(run, lambda event: notify(event[1]))
+        stack.callback(client.unsubscribe_topic, run)
         items = {
             client.submit(_build_one, run, item, str(root / item.name), options, key=f"{run}-{item.name}"): item
             for item in captures
@@ -163,16 +142,6 @@ def _run(
             with contextlib.suppress(TimeoutError):
                 wait(list(items), timeout=_STOP_SECONDS)
             raise
-
-
-@contextlib.contextmanager
-def _listening(client: Client, run: str, notify: Notify) -> Iterator[None]:
-    """Forward the messages of a run's workers to the callback."""
-    client.subscribe_topic(run, lambda event: notify(event[1]))
-    try:
-        yield
-    finally:
-        client.unsubscribe_topic(run)
 
 
 def _cancel(run: str) -> None:
@@ -256,12 +225,9 @@ class _IgnoreInterrupt(WorkerPlugin):
 
 @contextlib.contextmanager
 def local_cluster(workers: int, retries: int) -> Iterator[Client]:
-    """Start single-threaded worker processes on the loopback interface, and yield a client connected to them.
+    """Run single-threaded worker processes on the loopback interface, and yield a client connected to them.
 
-    The processes end with the context.
-
-    Args:
-        retries: number of retries of a task after its worker died.
+    A task is retried up to `retries` times after its worker died.
     """
     settings = {
         "distributed.scheduler.allowed-failures": retries,
@@ -307,9 +273,8 @@ def existing_cluster(address: str) -> Iterator[Client]:
         try:
             client.wait_for_workers(1, timeout=CONNECT_SECONDS)
         except TimeoutError as error:
-            raise ClusterError(
-                f"the scheduler at {address} has no worker.", hint="Start some with: dask worker ADDRESS --nthreads 1"
-            ) from error
+            hint = "Start some with: dask worker ADDRESS --nthreads 1"
+            raise ClusterError(f"the scheduler at {address} has no worker.", hint=hint) from error
         yield client
 
 
@@ -322,11 +287,7 @@ async def _greet(address: str) -> None:
 
 
 def check_workers(client: Client, folder: Path) -> None:
-    """Check that every worker runs this version of jawusd and can access the output folder.
-
-    Raises:
-        ClusterError: a worker cannot be used.
-    """
+    """Raise ClusterError unless every worker runs this version of jawusd and can access the output folder."""
     for address, answer in client.run(_look, str(folder), on_error="return").items():
         if isinstance(answer, Exception):
             raise ClusterError(f"worker {address} cannot run jawusd ({type(answer).__name__}: {answer}).")
@@ -334,10 +295,8 @@ def check_workers(client: Client, folder: Path) -> None:
         if version != __version__:
             raise ClusterError(f"worker {address} runs jawusd {version}, but this process runs {__version__}.")
         if not sees_folder:
-            raise ClusterError(
-                f"worker {address} cannot access {folder}.",
-                hint="Use a folder that all machines share under the same path.",
-            )
+            hint = "Use a folder that all machines share under the same path."
+            raise ClusterError(f"worker {address} cannot access {folder}.", hint=hint)
 
 
 def _look(folder: str) -> tuple[str, bool]:

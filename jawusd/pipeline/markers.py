@@ -55,35 +55,21 @@ def marker_poses(
     if table.unit not in (None, unit) and unit != "mm":
         raise FormatError(f"is in {table.unit}, but --length-unit is {unit}.", path=path)
     points = table.points * LENGTH_UNITS_MM[table.unit or unit]
-    bodies = {name: read_body(description) for name, description in rigid.items()}
-    moved = {
-        name: _moved(name, body, points, table.names, rest_frame, LENGTH_UNITS_MM[unit], path)
-        for name, body in bodies.items()
-    }
+    moved = {name: _moved(name, body, points, table.names, rest_frame, unit, path) for name, body in rigid.items()}
     return se3_inverse(moved["head"]) @ moved["jaw"] if "head" in moved else moved["jaw"], table.fps
 
 
 def in_head(
-    points: Array,
-    names: tuple[str, ...],
-    rigid: Mapping[str, str],
-    rest_frame: int | None,
-    unit: str,
-    path: Path,
+    points: Array, names: tuple[str, ...], rigid: Mapping[str, str], rest_frame: int | None, unit: str, path: Path
 ) -> Array:
-    """Return points (F, N, 3) [mm] relative to the head, NaN in frames in which the head is occluded.
-
-    Args:
-        rigid: description of the rigid body "head"; see `formats.rigid_bodies.read_body`.
-        rest_frame: frame that defines the marker positions on the head, if only the names of its markers are given.
-        unit: unit of the rigid body, a key of `LENGTH_UNITS_MM`.
+    """Return points (F, N, 3) [mm] relative to the rigid body "head", NaN where it is occluded; see `marker_poses`.
 
     Raises:
         FormatError: a rigid body other than the head is given, or the head does not fit the markers.
     """
     if set(rigid) != {"head"}:
         raise FormatError(f'rigid bodies given: {", ".join(rigid)}; only "head" is allowed.', path=path)
-    T = _moved("head", read_body(rigid["head"]), points, names, rest_frame, LENGTH_UNITS_MM[unit], path)
+    T = _moved("head", rigid["head"], points, names, rest_frame, unit, path)
     return transform_points(se3_inverse(T), points)
 
 
@@ -130,7 +116,7 @@ def read_c3d(path: str | os.PathLike[str]) -> MarkerTable:
 
 
 def _check_length(path: Path) -> None:
-    """Check that a C3D file is not truncated; for truncated files, ezc3d returns arbitrary frames or hangs."""
+    """Raise FormatError if a C3D file is truncated; ezc3d would return arbitrary frames, or hang."""
     with open(path, "rb") as file:
         head = file.read(_BLOCK)
         file.seek((max(head[0], 1) - 1) * _BLOCK + 3 if head else 0)
@@ -151,16 +137,10 @@ def _columns(body: RigidBody, names: tuple[str, ...], count: int, called: str, p
     own = [name.rpartition(":")[2] for name in names]
     found = []
     for marker in body.markers:
-        if (
-            isinstance(marker, int)
-            and str(marker) in own
-            and body.points is None
-            and own.index(str(marker)) != marker - 1
-        ):
+        number = own.index(str(marker)) + 1 if str(marker) in own else None
+        if isinstance(marker, int) and body.points is None and number not in (None, marker):
             raise FormatError(
-                f'"{marker}" is ambiguous: the name of marker {own.index(str(marker)) + 1} '
-                "and the number of another marker.",
-                path=path,
+                f'"{marker}" is ambiguous: the name of marker {number} and the number of another marker.', path=path
             )
         places = [marker - 1] if isinstance(marker, int) else [k for k, name in enumerate(names) if name == marker]
         if not places:
@@ -176,17 +156,13 @@ def _columns(body: RigidBody, names: tuple[str, ...], count: int, called: str, p
 
 
 def _moved(
-    name: str,
-    body: RigidBody,
-    points: Array,
-    names: tuple[str, ...],
-    rest_frame: int | None,
-    unit_mm: float,
-    path: Path,
+    name: str, described: str, points: Array, names: tuple[str, ...], rest_frame: int | None, unit: str, path: Path
 ) -> Array:
     """Return the poses (F, 4, 4) of a rigid body in the coordinate frame of the table."""
+    body = read_body(described)
     seen = points[:, _columns(body, names, points.shape[1], name, path)]
-    shape = _shape_at(rest_frame, seen, body, name, path) if body.points is None else body.points * unit_mm
+    given = None if body.points is None else body.points * LENGTH_UNITS_MM[unit]
+    shape = _shape_at(rest_frame, seen, body, name, path) if given is None else given
     T, off_mm = rigid_fits(shape, seen)
     if not np.isfinite(off_mm).any():
         raise FormatError(f"no frame shows three markers of the {name} that are not collinear.", path=path)

@@ -44,9 +44,6 @@ _MOST_FACES = 6000  # maximum number of faces of a mesh in the report's replay
 def draw_worst_frames(capture: Capture, offsets: Mapping[str, int], tracks: Tracks) -> tuple[Overlay, ...]:
     """Draw the scans over the footage in the worst frames, worst first, and in a typical frame.
 
-    Args:
-        offsets: frame offset by camera.
-
     Raises:
         CaptureError, CalibrationError: see `open_footage`.
         FormatError: the tracks belong to another capture.
@@ -65,7 +62,6 @@ def draw_frames(
     """Draw the scans over images or masks.
 
     Args:
-        offsets: frame offset by camera.
         chosen: the frames, each as its row in the tracks and the reason for drawing it.
         names: cameras to draw; None: all with a video or masks.
 
@@ -128,7 +124,6 @@ def write_plates(
     """Write undistorted plates, EXR for EXR footage and JPEG otherwise, at the paths in `cameras.usda`.
 
     Args:
-        offsets: frame offset by camera.
         frames: increasing frames of the reference camera, shape (F,); frames without an image get no plate.
         folder: the rig's folder.
 
@@ -137,7 +132,6 @@ def write_plates(
 
     Raises:
         CaptureError, CalibrationError: see `open_footage`.
-        OutputError: the files cannot be written.
     """
     from jawusd.media.footage import PictureSequence
     from jawusd.media.writers import PlateWriter
@@ -168,11 +162,8 @@ def write_plates(
 
 
 def replay_parts(folder: Path, model: JawModel) -> tuple[ReplayPart, ...]:
-    """Return decimated meshes of a rig with the teeth closed, in the anatomical frame [mm], for the report.
-
-    Raises:
-        RigError: the rig has no geometry.
-    """
+    """Return decimated meshes of a rig with the teeth closed, in the anatomical frame [mm], for the report."""
+    from jawusd.meshes.remeshing import decimated
     from jawusd.rig.geo import read_geometry, read_gum
 
     path = folder / "geo.usdc"
@@ -184,18 +175,11 @@ def replay_parts(folder: Path, model: JawModel) -> tuple[ReplayPart, ...]:
         place = A @ rest if moves else A
         gum = gums.get(name, np.zeros(len(mesh.faces), bool))
         kind = "tooth" if name.endswith("teeth") else "bone"
-        for part, faces in ((kind, mesh.faces[~gum]), ("gum", mesh.faces[gum])):
-            if len(faces):
-                small = _small(Mesh(mesh.vertices, faces))
-                placed = Mesh(transform_points(place, small.vertices), small.faces)
-                found.append(ReplayPart(name, part, moves, placed))
+        for part, chosen in ((kind, mesh.faces[~gum]), ("gum", mesh.faces[gum])):
+            if len(chosen):
+                vertices, faces = decimated(mesh.vertices, chosen, min(_MOST_FACES, len(chosen)))
+                found.append(ReplayPart(name, part, moves, Mesh(transform_points(place, vertices), faces)))
     return tuple(found)
-
-
-def _small(mesh: Mesh) -> Mesh:
-    from jawusd.meshes.remeshing import decimated
-
-    return Mesh(*decimated(mesh.vertices, mesh.faces, min(_MOST_FACES, len(mesh.faces))))
 
 
 SHEET = "contact_sheet.png"
@@ -224,13 +208,9 @@ def write_overlay(
     footage; missing images are gray. If `path` is an .mp4 file, all cameras are placed side by side, cropped to the
     teeth; cameras without footage show their masks. Existing files are overwritten.
 
-    Args:
-        offsets: frame offset by camera.
-
     Raises:
         CaptureError, CalibrationError: see `open_footage`.
         FormatError: the tracks belong to another capture.
-        OutputError: the files cannot be written.
     """
     check_same_cameras(capture, tracks)
     if path.suffix.lower() == VIDEO:
@@ -253,8 +233,7 @@ def _write_cameras(
     done, total = 0, len(backdrops) * len(tracks.frames)
     for name, backdrop in backdrops.items():
         width, height = (side // 2 * 2 for side in backdrop.size_px)  # H.264 needs even image sizes
-        writer = VideoWriter(folder / f"{name}.mp4", (width, height), capture.fps, quality_crf=_CRF)
-        with writer as out:
+        with VideoWriter(folder / f"{name}.mp4", (width, height), capture.fps, quality_crf=_CRF) as out:
             for image in _drawn(tracks, backdrop, cameras[name], scans):
                 out.write(image[:height, :width])
                 done += 1
@@ -305,11 +284,7 @@ def open_wall(
     scans: tuple[Mesh, Mesh],
     tile_px: tuple[int, int],
 ) -> CameraWall:
-    """Return a renderer of the images of all cameras side by side, each cropped to the teeth.
-
-    Raises:
-        CaptureError, CalibrationError: no camera has video or masks, or one cannot be read.
-    """
+    """Return a renderer of the images of all cameras side by side, each cropped to the teeth."""
     from jawusd.media.side_by_side import CameraWall
 
     backdrops = open_backdrops(capture, offsets)

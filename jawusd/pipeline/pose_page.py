@@ -25,16 +25,11 @@ _TILE_PX, _MOST_IMAGES, _QUALITY = (320, 240), 150, 50
 def write_page(
     path: str | os.PathLike[str] | None, out: Path, prim: str | None = None, *, footage: bool = False
 ) -> None:
-    """Write a page that poses the rig at a path; other arguments and further errors are those of `viewed_actor`.
-
-    Args:
-        footage: also write the footage of the take into the page.
+    """Write a page that poses the rig at a path, with the footage of its take if wanted; see `viewed_actor`.
 
     Raises:
         CaptureError: there is no footage, or it cannot be decoded.
-        OutputError: the file cannot be written.
         RigError: the contacts of the teeth cannot be computed from the rig's meshes.
-        MissingDependencyError: a package is missing.
     """
     from jawusd.report.pose_page import PosePage, write_pose_page
     from jawusd.rig.read import describe

@@ -18,7 +18,7 @@ from jawusd.formats.experiments import Experiments, save_table
 from jawusd.formats.finding import Finding, FoundJson
 from jawusd.formats.model import JawModel, load_model
 from jawusd.formats.notes import SyncNotes
-from jawusd.formats.report import BuildVerdict, CameraFacts, Origin, ReportData, RigFacts
+from jawusd.formats.report import BuildVerdict, CameraFacts, Origin, Overlay, ReportData, RigFacts
 from jawusd.formats.tracks import Tracks, load_tracks
 from jawusd.pipeline.cameras import load_cameras
 from jawusd.pipeline.contact import contact_pictures
@@ -33,7 +33,6 @@ from jawusd.pipeline.state import (
     BuildState,
     Progress,
     ReportSummary,
-    Stages,
     locked,
     no_progress,
     recorded_origin,
@@ -62,16 +61,12 @@ class BuildFacts:
     """Facts of a finished build, with its capture if that is available."""
 
     state: BuildState
-    capture: Capture | None  # None if the capture is not available
+    capture: Capture | None
     origin: Origin
     why_not: str = ""  # why the capture is not available
 
     def given(self) -> Capture:
-        """Return the capture.
-
-        Raises:
-            FormatError: the capture is not available.
-        """
+        """Return the capture; raises FormatError if it is not available."""
         if self.capture is None:
             raise FormatError(self.why_not)
         return self.capture
@@ -99,12 +94,12 @@ def write_build_report(
     tracks, model = load_tracks(folder / "tracks.npz"), load_model(folder / "model.npz")
     subject = subject_of_build(folder)
     unmet, unseen = list[str](), list[str]()
-    # Decoding, drawing and measuring images releases the GIL.
-    with ThreadPoolExecutor(1) as pool:
-        images = "images of the footage"
-        drawn = pool.submit(
-            attempt, images, unseen, lambda: draw_worst_frames(facts.given(), recorded_offsets(facts.state), tracks)
-        )
+
+    def draw() -> tuple[Overlay, ...]:
+        return draw_worst_frames(facts.given(), recorded_offsets(facts.state), tracks)
+
+    with ThreadPoolExecutor(1) as pool:  # decoding, drawing and measuring images releases the GIL
+        drawn = pool.submit(attempt, "images of the footage", unseen, draw)
         contacts = attempt("contacts of the teeth", unmet, lambda: contact_pictures(model, subject)) or ()
         data = _without_pictures(folder, facts, tracks, model, subject, experiments)
         progress("report", 1, 4)
@@ -123,9 +118,12 @@ def _without_pictures(
     folder: Path, facts: BuildFacts, tracks: Tracks, model: JawModel, subject: Subject, experiments: Experiments | None
 ) -> ReportData:
     """Return the data of a report, except for the images of footage and teeth."""
-    from jawusd.rig.read import describe
+    from jawusd.rig import describe, validate_stage
 
+    about, findings = describe(folder / "actor.usda"), validate_stage(folder / "actor.usda")
     left_out: list[str] = []
+    checked = facts.state.result("check", CheckResult)
+    stages = {name: record for name, record in facts.state.stages.items() if name != "report"}
     if experiments is None:
         experiments = attempt(
             "experiments",
@@ -133,7 +131,7 @@ def _without_pictures(
             lambda: run_paper_experiments(subject, load_tracks(fitted_poses(folder)), 1, no_progress, quick=True),
         )
         left_out.append(_NETWORKS)
-    if describe(folder / "actor.usda")["placeholders"]:
+    if about["placeholders"]:
         left_out.append("the mandible in 3-D: no mesh was given, and the rig's placeholder is not anatomical.")
     return ReportData(
         actor=subject.name,
@@ -142,15 +140,15 @@ def _without_pictures(
         sync=facts.state.result("sync", SyncNotes) or {},
         cameras=attempt("cameras", left_out, lambda: camera_facts(facts.given())) or (),
         inferred=tuple(fit_summary(model).get("inferred", ())),
-        seconds={name: record.seconds for name, record in facts.state.stages.items() if name != "report"},
-        hashes=_hashes(facts.state.stages),
+        seconds={name: record.seconds for name, record in stages.items()},
+        hashes=dict(sorted(output for record in stages.values() for output in record.outputs.items())),
         origin=facts.origin,
-        rig=_rig_facts(folder),
+        rig=RigFacts(float(about["table"]["max_error_mm"]), tuple(f"{f.severity}: {f.message}" for f in findings)),
         experiments=experiments,
         overlays=(),
         parts=attempt("3-D replay", left_out, lambda: replay_parts(folder, model)) or (),
         left_out=tuple(left_out),
-        findings=_check_findings(facts.state),
+        findings=tuple(map(Finding.from_json, checked["findings"] if checked else ())),
     )
 
 
@@ -162,12 +160,10 @@ def report_build(
     *,
     allow_outside: bool = False,
 ) -> Path:
-    """Write the report of a finished build again and return its path.
+    """Write the report of a finished build again and return its path; see `write_build_report`.
 
     Args:
         capture: capture.toml or its folder; None: as recorded in the build.
-        experiments: as for `write_build_report`.
-        allow_outside: allow paths in the capture that point outside its folder.
 
     Raises:
         FormatError: the path is not the folder of a build, or its files are corrupt or were modified.
@@ -203,7 +199,7 @@ def is_build(folder: Path) -> bool:
 
 
 def fitted_poses(folder: Path) -> Path:
-    """Return the tracks to which a build fitted its model: those of the first pass, without the model as a prior."""
+    """Return the tracks to which a build fitted its model: those of the first pass."""
     first = folder / FIRST_PASS
     return first if first.is_file() else folder / "tracks.npz"
 
@@ -219,15 +215,9 @@ def missing_packages() -> str | None:
 
 
 def build_facts(folder: Path, state: BuildState, capture: Capture | None, *, allow_outside: bool = False) -> BuildFacts:
-    """Return the facts of a build, with its capture if it can be found.
-
-    Args:
-        capture: capture.toml or its folder; None: use the path recorded in the build.
-        allow_outside: allow paths in the capture that point outside its folder.
-    """
-    record = state.stages.get("report")
-    origin = recorded_origin(record.result if record else {})
-    place = (state.result("report", ReportSummary) or {}).get("capture")
+    """Return the facts of a build, with its capture, by default that at the recorded path, if it can be read."""
+    reported = state.result("report", ReportSummary) or {}
+    origin, place = recorded_origin(reported), reported.get("capture")
     if capture is not None:
         return BuildFacts(state, as_built(capture, folder), origin)
     if not place:
@@ -266,49 +256,21 @@ def attempt(what: str, left_out: list[str], work: Callable[[], T]) -> T | None:
 
 
 def recorded_offsets(state: BuildState) -> dict[str, int]:
-    """Return the frame offset of every camera recorded by a build; empty if the build did not synchronise them.
-
-    Raises:
-        FormatError: build.json is corrupt.
-    """
+    """Return the recorded frame offset of every camera; empty if the build did not synchronise them."""
     return (state.result("sync", SyncNotes) or {}).get("offsets", {})
 
 
 def camera_facts(capture: Capture) -> tuple[CameraFacts, ...]:
-    """Return the footage, masks and image size of each camera.
-
-    Raises:
-        CalibrationError, CaptureError: see `load_cameras`.
-    """
-    sizes = {camera.name: camera.size_px for camera in load_cameras(capture)}
+    """Return the footage, masks and image size of each camera; raises like `load_cameras`."""
     return tuple(
         CameraFacts(
             source.name,
             source.video.name if source.video else "",
             f"{source.masks.upper.name}, {source.masks.lower.name}" if source.masks else "",
-            (int(sizes[source.name][0]), int(sizes[source.name][1])),
+            (int(camera.size_px[0]), int(camera.size_px[1])),
         )
-        for source in capture.cameras
+        for source, camera in zip(capture.cameras, load_cameras(capture), strict=True)
     )
-
-
-def _rig_facts(folder: Path) -> RigFacts:
-    from jawusd.rig import describe, validate_stage
-
-    found = validate_stage(folder / "actor.usda")
-    error_mm = float(describe(folder / "actor.usda")["table"]["max_error_mm"])
-    return RigFacts(error_mm, tuple(f"{finding.severity}: {finding.message}" for finding in found))
-
-
-def _check_findings(state: BuildState) -> tuple[Finding, ...]:
-    """Return the findings of the check before the first stage."""
-    found = state.result("check", CheckResult)
-    return tuple(Finding.from_json(one) for one in found["findings"]) if found else ()
-
-
-def _hashes(stages: Stages) -> dict[str, str]:
-    found = {name: value for key, record in stages.items() if key != "report" for name, value in record.outputs.items()}
-    return dict(sorted(found.items()))
 
 
 @explain_missing_packages()
@@ -343,11 +305,7 @@ def run_paper_experiments(
 
 @explain_missing_packages()
 def draw_experiments(found: Experiments, folder: Path) -> list[Path]:
-    """Write the figures and the table of the experiments to a folder; return the files written.
-
-    Raises:
-        OutputError: a file cannot be written.
-    """
+    """Write the figures and the table of the experiments to a folder; return the files written."""
     from jawusd.paper import figures
 
     files = figures.draw_experiments(found, folder)

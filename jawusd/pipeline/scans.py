@@ -84,20 +84,15 @@ def label_scans(
 
 def all_labelled(capture: Capture) -> bool:
     """Return whether both teeth scans are labelled by paint or files; raises like `load_meshes`."""
-    scans = capture.scans
-    files = {name: getattr(scans, name) for name in TEETH.values()}
-    open_ones = {name: path for name, path in files.items() if not labels_path(path, scans.labels).is_file()}
-    return all(painted_labels(mesh) is not None for mesh in read_files(open_ones).values())
+    files = {name: getattr(capture.scans, name) for name in TEETH.values()}
+    unlabelled = {name: path for name, path in files.items() if not labels_path(path, capture.scans.labels).is_file()}
+    return all(painted_labels(mesh) is not None for mesh in read_files(unlabelled).values())
 
 
 def store_labels(capture: Capture, folder: Path) -> list[Path]:
     """Write the labels of both teeth scans to a folder if either is labelled by shape; return the files written.
 
     Labels written by an earlier call are deleted.
-
-    Raises:
-        FormatError, CaptureError: a scan or its labels cannot be read.
-        OutputError: a file cannot be written.
     """
     scans = labelled_teeth(capture, capture.scans.labels)
     written = []
@@ -122,15 +117,7 @@ def with_stored_labels(capture: Capture, folder: Path) -> Capture:
 
 
 def save_reviewed(scans: Scans, meshes: Mapping[str, Mesh], arch: str, labels: NDArray[np.uint8]) -> Path:
-    """Write the reviewed labels (V,) of one scan to its label file; return the file.
-
-    Args:
-        scans: the scans' paths in the capture.
-        meshes: the scans by arch.
-
-    Raises:
-        OutputError: the file cannot be written.
-    """
+    """Write the reviewed labels (V,) of one of the scans (by arch) to its label file; return the file."""
     path = labels_path(getattr(scans, TEETH[arch]), scans.labels)
     save_scan_labels(path, ScanLabels(labels, "reviewed"), meshes[arch])
     return path

@@ -31,44 +31,27 @@ _LARGEST_SIGMA_MM = 1.0  # standard deviation at the incisal point above which a
 
 @dataclass(frozen=True)
 class SkinOptions:
-    """Facial-skin inputs of `solve`.
+    """Facial-skin inputs of `solve`."""
 
-    Attributes:
-        skin: the map from skin to d, written by `jawusd skin-fit`.
-        face: facial motion during the shot; it has the columns from which the map was learned.
-        fps: frame rate of the face data [1/s], if the file does not state it.
-        offset_s: seconds from frame 0 of the shot to frame 0 of the face data; None: estimated.
-        unit, rigid, rest_frame: see `read_face`.
-        only: whether to ignore the images of the shot.
-    """
-
-    skin: str | os.PathLike[str]
-    face: str | os.PathLike[str]
-    fps: float | None = None
-    offset_s: float | None = None
-    unit: str = "mm"
-    rigid: Mapping[str, str] | None = None
-    rest_frame: int | None = None
-    only: bool = False
+    skin: str | os.PathLike[str]  # the map from skin to d, written by `jawusd skin-fit`
+    face: str | os.PathLike[str]  # facial motion during the shot; it has the columns from which the map was learned
+    fps: float | None = None  # frame rate of the face data [1/s], if the file does not state it
+    offset_s: float | None = None  # seconds from frame 0 of the shot to frame 0 of the face data; None: estimated
+    unit: str = "mm"  # see `read_face`
+    rigid: Mapping[str, str] | None = None  # see `read_face`
+    rest_frame: int | None = None  # see `read_face`
+    only: bool = False  # whether to ignore the images of the shot
 
 
 @dataclass(frozen=True, eq=False)
 class JawTake:
-    """The jaw motion of a take, and the frames in which the teeth were visible.
+    """The jaw motion of a take, and the frames in which the teeth were visible."""
 
-    Attributes:
-        frames: frame numbers, increasing, shape (F,).
-        d: jaw parameters [mm], shape (F, 3).
-        seen: whether d was measured rather than interpolated, shape (F,).
-        sigma_mm: standard deviation of d [mm], shape (F, 3).
-        fps: frame rate [1/s]; None if unknown.
-    """
-
-    frames: Array
-    d: Array
-    seen: Mask
-    sigma_mm: Array
-    fps: float | None
+    frames: Array  # frame numbers, increasing, shape (F,)
+    d: Array  # jaw parameters [mm], shape (F, 3)
+    seen: Mask  # whether d was measured rather than interpolated, shape (F,)
+    sigma_mm: Array  # standard deviation of d [mm], shape (F, 3)
+    fps: float | None  # frame rate [1/s]; None if unknown
 
     def at_rate(self, fps: float) -> JawTake:
         """Return the take with its frame rate replaced."""
@@ -155,10 +138,8 @@ def own_columns(skin: Skin, map_path: str | os.PathLike[str], face: FaceTable, p
     """Return the columns (F, K) or points (F, N, 3) from which a map was learned, found in face data by name.
 
     Args:
-        skin: the map.
-        map_path: its file, for messages.
-        face: face data, which may have more columns or points.
-        path: their file, for messages.
+        face: face data, which may have more columns or points than the map.
+        map_path, path: files of the map and of the face data, for messages.
 
     Raises:
         FormatError: a column or point is missing, or the data have points and the map columns, or conversely.
@@ -190,9 +171,8 @@ def read_face(
     """Read facial motion from C3D, a marker table, a CSV of Live Link Face, or a face table; points are in mm.
 
     Args:
-        path: the file; see `formats.markers`, `formats.arkit` and `formats.face_table`.
-        fps: frame rate [1/s], if the file does not state it.
-        unit: unit of the points, if the file does not state it.
+        path: see `formats.markers`, `formats.arkit` and `formats.face_table`.
+        fps, unit: frame rate [1/s] and unit of the points, if the file does not state them.
         rigid: the rigid body "head", formed by markers on the head (see `formats.rigid_bodies`); points are then
             returned relative to it. Default: the head does not move, or the points are stabilised.
         rest_frame: frame that defines the marker positions on the head, if only the names of its markers are given.
@@ -201,13 +181,13 @@ def read_face(
         FormatError: the file is none of these, or the head cannot be found.
     """
     path = Path(path)
-    marked = path.suffix.lower() == ".c3d" or not path.is_file() or path.suffix.lower() == ".trc"
+    marked = path.suffix.lower() in (".c3d", ".trc") or not path.is_file()
     header = [] if marked else header_of(path)
     if "timecode" in header:
         face = read_blend_face(path, fps)
     elif is_face_table(header):
         face = read_face_table(path)
-        face = FaceTable(face.frames, face.X, face.names, face.fps or fps)
+        face = replace(face, fps=face.fps or fps)
     else:
         table = read_c3d(path) if path.suffix.lower() == ".c3d" else read_markers(path)
         frames = np.arange(len(table.points), dtype=np.float64)
@@ -226,7 +206,7 @@ def read_shot_face(skin: Skin, options: SkinOptions) -> tuple[Array, Array]:
     """Return the times (F,) [s] of the face data of a shot, and the columns (F, K) from which a map was learned.
 
     Raises:
-        FormatError: the file is invalid, or has other columns than those of the map or no frame rate.
+        FormatError: the file is invalid, or lacks a frame rate or columns of the map.
     """
     face = read_face(options.face, options.fps, options.unit, options.rigid, options.rest_frame)
     columns = own_columns(skin, options.skin, face, options.face)
@@ -254,18 +234,16 @@ def learn_skin(
     offset_s: float | None = None,
     head_error: tuple[float, float] = HEAD_ERROR,
 ) -> tuple[Skin, float]:
-    """Learn to estimate d from facial motion, given recordings of face and jaw in one performance, with frame rates.
+    """Learn to estimate d from facial motion; see `fitting.skin.fit_skin` and `fitting.skin.clock_offset`.
 
     Args:
-        offset_s: seconds to add to times of the face recording to obtain times of the jaw recording; default:
-            estimated.
-        head_error: see `fitting.skin.fit_skin`.
+        jaw, face: recordings of one performance, with frame rates.
+        offset_s: seconds to add to times of `face` to obtain times of `jaw`; default: estimated.
 
     Returns:
         The map from face to d, and the offset [s].
 
     Raises:
-        FittingError: see `fitting.skin.clock_offset` and `fitting.skin.fit_skin`.
         ValueError: a frame rate is missing.
     """
     if not jaw.fps or not face.fps:
@@ -285,11 +263,7 @@ def learn_jaw_weights(
     offset_s: float | None = None,
     head_error: tuple[float, float] = (0.0, 0.0),
 ) -> tuple[Skin, float]:
-    """Learn to estimate d from the four ARKit jaw weights; arguments, results and further errors as in `learn_skin`.
-
-    Raises:
-        FittingError: see `fitting.face.check_jaw_weights`.
-    """
+    """Learn to estimate d from the four ARKit jaw weights; see `learn_skin` and `fitting.face.check_jaw_weights`."""
     skin, offset_s = learn_skin(rig, jaw, face, offset_s, head_error)
     face_s, times_s = face.frames / (face.fps or 1.0), jaw.frames[jaw.seen] / (jaw.fps or 1.0)
     check_jaw_weights(rig, columns_at(face_s + offset_s, face.X, times_s), jaw.d[jaw.seen], skin.errors_mm["skin"])

@@ -27,12 +27,7 @@ _MOST_UNSEEN, _MOST_UNCERTAIN, _MOST_OUTSIDE = 3, 2, 2  # number of frames drawn
 
 @explain_missing_packages()
 def check_page(path: str | os.PathLike[str]) -> None:
-    """Check, before any work, that a report can be written to a file of this name.
-
-    Raises:
-        OutputError: the suffix of the file is not .html.
-        MissingDependencyError: matplotlib or jinja2 is not installed.
-    """
+    """Raise OutputError unless a file name ends in .html, and MissingDependencyError if packages are missing."""
     import jawusd.report.solve_page  # noqa: F401
 
     if Path(path).suffix.lower() != PAGE:
@@ -42,13 +37,9 @@ def check_page(path: str | os.PathLike[str]) -> None:
 def report_solve(
     tracks: Path, capture: str | os.PathLike[str] | None, page: Path, progress: Progress, *, allow_outside: bool = False
 ) -> Path:
-    """Write the report of a solve from its tracks, and return its path.
+    """Write the report of a solve from the .npz file of its tracks; return the path of the page.
 
-    Args:
-        tracks: the .npz file written by `solve`.
-        capture: the shot, its capture.toml or its folder; None: the report has no images and no cameras.
-        page: file to write.
-        allow_outside: allow paths in the capture that point outside its folder.
+    Without the capture of the shot, the report has no images and no cameras.
 
     Raises:
         FormatError: the tracks were not written by `solve`.
@@ -81,12 +72,7 @@ def write_solve_report(
     progress: Progress,
     name: str = "",
 ) -> None:
-    """Write the report of a solve, given its tracks and cameras.
-
-    Args:
-        capture: the shot; None: the report has no images and no cameras.
-        offsets: frame offset by camera.
-        name: name of a shot without a capture.
+    """Write the report of a solve; `name` is the name of a shot without a capture.
 
     Raises:
         FormatError: there is no capture, and the tracks contain no frame rate.
@@ -130,11 +116,7 @@ def _rate(tracks: Tracks) -> float:
 
 
 def frames_to_show(tracks: Tracks, fps: float) -> list[tuple[int, str]]:
-    """Return the frames to inspect, each as its row in the tracks and the reason.
-
-    Raises:
-        ValueError: the tracks were not written by `solve`.
-    """
+    """Return the frames of a solve to inspect, each as its row in the tracks and the reason; raises ValueError."""
     solved = tracks.solved
     if solved is None:
         raise ValueError("the tracks have no solved performance")

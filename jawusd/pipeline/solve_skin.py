@@ -1,7 +1,4 @@
-"""Jaw motion of a shot from facial skin: face data of the shot, aligned with its clock, or points in its own footage.
-
-Function objects for the solver: they check that the skin agrees with the visible teeth, or learn from those frames.
-"""
+"""Jaw motion of a shot from facial skin: face data, aligned with the shot's clock, or points in its own footage."""
 
 from __future__ import annotations
 
@@ -56,11 +53,7 @@ class SkinOfShot:
         self.offset_s, self.unfamiliar = options.offset_s, np.zeros(0, np.int64)
 
     def frames(self) -> range:
-        """Return the frames of the shot that the face data cover.
-
-        Raises:
-            FittingError: the offset between the clocks is unknown.
-        """
+        """Return the frames of the shot that the face data cover; raises FittingError if their offset is unknown."""
         first, last = (self._face_s[[0, -1]] + self._known_offset()) * self._fps
         return range(max(ceil(first), 0), max(floor(last) + 1, 0))
 
@@ -104,12 +97,7 @@ class SkinOfShot:
 
 
 def check_agreement(face: str | os.PathLike[str], found: SkinJaw, d: Array) -> None:
-    """Check that d from skin agrees with d from visible teeth.
-
-    Args:
-        face: the file of the face data, for messages.
-        found: d from skin in frames with visible teeth and a familiar face.
-        d: jaw parameters measured from the teeth in these frames [mm], shape (F, 3).
+    """Check that d from skin agrees with d (F, 3) [mm] from visible teeth, in frames with a familiar face.
 
     Raises:
         FittingError: the two differ by much more than their expected error.
@@ -142,7 +130,7 @@ class SkinOfFootage:
         footage: ColourFootage,
         progress: Callable[[int, int], None] = lambda done, total: None,
     ) -> None:
-        """Store the cameras of the footage by name; `progress` is called with the number of frames done and the total.
+        """Store the cameras of the footage by name.
 
         Raises:
             FittingError: there is only one camera.
@@ -174,12 +162,7 @@ class SkinOfFootage:
         return {"points": self.points, "frames": self.learned.frames, "errors_mm": self.learned.errors_mm}
 
     def followed(self, frames: list[int], d: Array, seen: Mask, heads: Array) -> Array:
-        """Return the points on the skin in the world [mm], shape (F, N, 3), NaN where they are not found.
-
-        Args:
-            frames: consecutive frame numbers of the shot.
-            d, seen, heads: see `__call__`.
-        """
+        """Return the points on the skin in the world [mm], shape (F, N, 3), NaN where not found; see `__call__`."""
         key, images = self._key(frames, d, seen)
         mouth = heads[key] @ se3_inverse(self._rig.T_anatomical_skull)
         incisor = self._rig.landmarks[0]
@@ -203,8 +186,7 @@ class SkinOfFootage:
             raise FittingError("no frame shows the teeth, from which the motion of the skin could be learned.")
         away = np.linalg.norm(d - np.median(d[seen], axis=0), axis=1)
         for key in np.argsort(np.where(seen, away, np.inf))[: int(seen.sum())].tolist():
-            images = self._footage.at(frames[key])
-            shown = {name: image for name, image in images.items() if image is not None}
+            shown = {name: image for name, image in self._footage.at(frames[key]).items() if image is not None}
             if set(shown) >= set(self._cameras):
                 return key, shown
         raise FittingError("no frame that shows the teeth has an image of every camera.")
@@ -213,11 +195,9 @@ class SkinOfFootage:
 def skin_of_footage(
     capture: Capture, jaw: JawRig, offsets: Mapping[str, int], free_focal: bool, progress: Progress
 ) -> SkinOfFootage:
-    """Return the estimator that uses skin in the videos of a shot; `offsets` are the frame offsets by camera.
+    """Return the estimator that uses skin in the videos of a shot; raises like `open_footage`.
 
     Raises:
-        CaptureError: no camera has a video, or one cannot be decoded.
-        CalibrationError: see `load_cameras`.
         FittingError: fewer than two cameras have videos, or focal lengths are unknown.
     """
     if free_focal:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
-from fractions import Fraction
 from pathlib import Path, PurePath
 from typing import TYPE_CHECKING
 
@@ -22,9 +22,7 @@ if TYPE_CHECKING:
     from jawusd.media.clip import Clip
 
 _PICTURES = 5  # number of images examined per board clip
-_USUAL_RATES = tuple(Fraction(n, d) for d in (1, 1001) for n in (24 * d, 25 * d, 30 * d, 50 * d, 60 * d, 120 * d)) + (
-    *(Fraction(n * 1000, 1001) for n in (24, 30, 60, 120)),
-)
+_USUAL_RATES = (24.0, 25.0, 30.0, 50.0, 60.0, 120.0, *(n * 1000 / 1001 for n in (24, 30, 60, 120)))
 _RATE_TOLERANCE = 2e-4  # relative difference below which frame rates count as equal; 24 and 23.976 differ by 1e-3
 
 
@@ -41,10 +39,9 @@ class CaptureStart:
 
 @explain_missing_packages()
 def start_capture(folder: Path, square_mm: float | None, fps: float | None, progress: Progress) -> CaptureStart:
-    """Return a draft capture of a folder; nothing is written.
+    """Return a draft capture of a folder with footage, scans, and board clips or a calibration; nothing is written.
 
     Args:
-        folder: folder with footage, scans, and board clips or a calibration.
         square_mm: side of the board's squares [mm], which cannot be derived from images.
         fps: frame rate [1/s]; None: the rate of the clips.
 
@@ -75,11 +72,7 @@ def start_capture(folder: Path, square_mm: float | None, fps: float | None, prog
 
 
 def write_start(start: CaptureStart) -> None:
-    """Write capture.toml.
-
-    Raises:
-        OutputError: the file cannot be written.
-    """
+    """Write capture.toml."""
     write_text_atomic(start.path, capture_text(start.sketch))
 
 
@@ -103,14 +96,11 @@ def _calibration(folder: Path, files: FoundFiles, out: CaptureStart) -> tuple[Pu
     """Return the calibration file, and the names of its cameras."""
     readable: dict[PurePath, list[str]] = {}
     for path in files.calibrations:
-        if path.name == "images.txt":
+        if path.name == "images.txt":  # belongs to the cameras.txt beside it
             continue
-        try:
-            readable[path] = [
-                camera.name for camera in read_calibration(folder / path, 1.0, lambda: SameSize((1920, 1080)))
-            ]
-        except JawusdError:
-            continue
+        with suppress(JawusdError):
+            cameras = read_calibration(folder / path, 1.0, lambda: SameSize((1920, 1080)))
+            readable[path] = [camera.name for camera in cameras]
     if len(readable) > 1:
         out.notes.append(f"{_listed(list(readable))} contain cameras; the first is used")
     for path, names in readable.items():
@@ -173,8 +163,8 @@ def _rate(opened: Mapping[PurePath, Clip], out: CaptureStart) -> float | None:
     for path, rate in rates.items():
         if abs(rate / found - 1) > 5e-3:
             out.notes.append(f"{path} has {rate:.5g} fps, but the other clips have {found:.5g}")
-    usual = min(_USUAL_RATES, key=lambda rate: abs(float(rate) / found - 1))
-    return round(float(usual) if abs(float(usual) / found - 1) < _RATE_TOLERANCE else found, 5)
+    usual = min(_USUAL_RATES, key=lambda rate: abs(rate / found - 1))
+    return round(usual if abs(usual / found - 1) < _RATE_TOLERANCE else found, 5)
 
 
 def _named_as_calibrated(

@@ -29,7 +29,7 @@ from jawusd.base.version import __version__
 from jawusd.formats.atomic import ELSEWHERE, clear_unfinished, destination, write_text_atomic
 from jawusd.formats.finding import Finding
 from jawusd.formats.report import BuildVerdict, Origin, verdict_sentence
-from jawusd.formats.text import parse_json, read_text
+from jawusd.formats.text import of_kind, parse_json, read_text
 
 FAMILY, VERSION = "jawusd-build", 1
 BUILD_FILE = "build.json"
@@ -86,10 +86,6 @@ class StageRecord(Generic[R_co]):
     result: R_co  # small results needed by later stages or by reports
 
 
-#: Finished stages by name.
-Stages = Mapping[str, StageRecord[Mapping[str, object]]]
-
-
 class BuildState:
     """The record of finished stages of one output folder, kept in build.json."""
 
@@ -126,22 +122,12 @@ class BuildState:
             return f"cannot be read ({error.strerror})"
 
     def result(self, stage: str, kind: type[R]) -> R | None:
-        """Return the result of a stage, checked against its type; None if the stage is not recorded.
-
-        Raises:
-            FormatError: the result has a different type.
-        """
-        from jawusd.formats.text import of_kind  # imported here because it is rarely needed
-
+        """Return the result of a stage, None if it is not recorded; raises FormatError if it has another type."""
         record = self.stages.get(stage)
         return None if record is None else of_kind(record.result, kind, stage, self.folder / BUILD_FILE, _AGAIN)
 
     def finish(self, stage: str, inputs: str, outputs: Iterable[Path], seconds: float, result: R) -> StageRecord[R]:
-        """Record a stage whose output files are complete, and write build.json; see `StageRecord`.
-
-        Raises:
-            OutputError: build.json cannot be written.
-        """
+        """Record a stage whose output files are complete, and write build.json; raises OutputError if that fails."""
         hashes = {str(path.relative_to(self.folder)): hash_files([path]) for path in outputs}
         record = StageRecord(inputs, hashes, round(seconds, 3), result)
         self.stages[stage] = record
@@ -200,11 +186,7 @@ class ReportSummary(TypedDict):
 
 
 def recorded_verdict(folder: Path) -> str | None:
-    """Return the verdict on a build; see `verdict_sentence`.
-
-    Returns None for a folder without a build, for a build without a report, and if build.json is corrupt, which
-    `changed_files` reports.
-    """
+    """Return the verdict on a build; None without a build or report, and if build.json is corrupt."""
     try:
         found = BuildState(folder).result("report", ReportSummary)
     except FormatError:
@@ -280,6 +262,7 @@ def _lock(handle: int, folder: Path) -> bool:
 
 
 def _take(handle: int) -> None:
+    """Lock an open file; raises OSError if it is locked."""
     if sys.platform == "win32":
         import msvcrt
 

@@ -57,8 +57,7 @@ def label_teeth(
     """Return the teeth scans among the meshes, with their labels, by arch.
 
     Args:
-        meshes: meshes by the names in `MESHES`.
-        files: mesh files by the same names.
+        meshes, files: meshes and their files by the names in `MESHES`.
         folder: folder of the label files; None: the folder of each scan.
         ignore_files: ignore existing label files.
 
@@ -82,12 +81,8 @@ def _labelled(arch: str, mesh: Mesh, path: Path, file: Path | None, other: Array
         stored = load_scan_labels(file, mesh)
         of = "reviewed" if stored.source == "reviewed" else "found by shape"
         over = "; its paint is ignored" if painted is not None else ""
-        note = Finding(
-            "scan_labels_from_file",
-            "note",
-            f"crown and gum of the {arch} scan are labelled by {file.name} ({of}){over}.",
-            path=str(path),
-        )
+        message = f"crown and gum of the {arch} scan are labelled by {file.name} ({of}){over}."
+        note = Finding("scan_labels_from_file", "note", message, path=str(path))
         labelled = replace(mesh, labels=stored.labels)
         return LabelledScan(arch, path, labelled, "file", stored, None, (note, *_weak_border(arch, stored, path)))
     if painted is not None:
@@ -101,17 +96,13 @@ def _by_shape(arch: str, mesh: Mesh, path: Path, other: Array | None) -> Labelle
     shape = label_scan(mesh, other)
     found = ScanLabels(shape.labels, "automatic", shape.weak_share)
     if (found.labels == GUM).any():
-        message = (
-            f"the {arch} scan is not painted; by its shape, {100 * np.mean(found.labels != GUM):.0f} % of it is crown."
-        )
-        note = Finding(
-            "scan_labels_from_shape", "note", message, path=str(path), hint="Inspect it with `jawusd scans`."
-        )
+        kind, crown = "scan_labels_from_shape", 100 * np.mean(found.labels != GUM)
+        message = f"the {arch} scan is not painted; by its shape, {crown:.0f} % of it is crown."
+        hint = "Inspect it with `jawusd scans`."
     else:
-        message = f"the {arch} scan has no paint and no gum; all of it counts as crown."
+        kind, message = "scan_crowns_only", f"the {arch} scan has no paint and no gum; all of it counts as crown."
         hint = "If it has gum, paint it with the brush in `jawusd view`."
-        note = Finding("scan_crowns_only", "note", message, path=str(path), hint=hint)
-    findings = (note, *_weak_border(arch, found, path))
+    findings = (Finding(kind, "note", message, path=str(path), hint=hint), *_weak_border(arch, found, path))
     return LabelledScan(arch, path, replace(mesh, labels=found.labels), "shape", found, shape, findings)
 
 
@@ -124,9 +115,8 @@ def _weak_border(arch: str, labels: ScanLabels, path: Path) -> tuple[Finding, ..
         f"{100 * _WEAK_SHARE:.0f} % is usual."
     )
     hint = "Inspect the image that `jawusd scans` writes, and correct the labels in `jawusd view`."
-    return (
-        Finding("scan_border_unclear", "warning", message, labels.weak_share, _WEAK_SHARE, path=str(path), hint=hint),
-    )
+    kind, share = "scan_border_unclear", labels.weak_share
+    return (Finding(kind, "warning", message, share, _WEAK_SHARE, path=str(path), hint=hint),)
 
 
 BONES = ("mandible", "skull")
@@ -168,27 +158,17 @@ def read_files(files: Mapping[str, Path]) -> dict[str, Mesh]:
 
 
 def labelled_teeth(capture: Capture, folder: Path | None, *, ignore_files: bool = False) -> list[LabelledScan]:
-    """Return the upper and the lower scan with labels; `folder` is that of the label files, None if beside the scans.
-
-    Args:
-        ignore_files: ignore existing label files.
-
-    Raises:
-        CaptureError, FormatError: see `load_meshes`.
-    """
+    """Return the upper and the lower scan with labels; see `label_teeth` and, for errors, `load_meshes`."""
     files = {name: getattr(capture.scans, name) for name in TEETH.values()}
     return list(label_teeth(read_files(files), files, folder, ignore_files=ignore_files).values())
 
 
 def registered_meshes(meshes: Mapping[str, Mesh], meta: Mapping[str, object]) -> dict[str, Mesh]:
     """Return the meshes, with the lower scan moved by the registration in the metadata of tracks or a model, if any."""
-    T = registration_of(meta)
-    out = dict(meshes)
-    if T is not None and "lower_teeth" in meshes:
-        out["lower_teeth"] = replace(
-            meshes["lower_teeth"], vertices=transform_points(T, meshes["lower_teeth"].vertices)
-        )
-    return out
+    T, lower = registration_of(meta), meshes.get("lower_teeth")
+    if T is None or lower is None:
+        return dict(meshes)
+    return {**meshes, "lower_teeth": replace(lower, vertices=transform_points(T, lower.vertices))}
 
 
 def registration_of(meta: Mapping[str, object]) -> Array | None:
@@ -213,10 +193,8 @@ class Subject:
 
     def measured_points(self) -> Array | None:
         """Return the vertices (V, 3) [mm] at which errors are measured: the mandible's or else the lower teeth's."""
-        for name in ("mandible", "lower_teeth"):
-            if name in self.meshes:
-                return self.meshes[name].vertices
-        return None
+        found = self.meshes.get("mandible") or self.meshes.get("lower_teeth")
+        return None if found is None else found.vertices
 
 
 def registered_subject(subject: Subject, meta: Mapping[str, object]) -> Subject:
@@ -241,17 +219,13 @@ def subject_of_capture(capture: Capture, meshes: Mapping[str, Mesh] | None = Non
     """
     named = capture.anatomy.landmarks or {}
     known = (*LANDMARKS, *_TRAGIONS)
-    unknown = sorted(set(named) - set(known))
-    if unknown:
-        raise CaptureError(
-            f'[anatomy.landmarks] has the unknown landmark "{unknown[0]}"; must be one of {", ".join(known)}.',
-            path=capture.folder / "capture.toml",
-        )
+    path = capture.folder / "capture.toml"
+    if unknown := sorted(set(named) - set(known)):
+        message = f'has the unknown landmark "{unknown[0]}"; must be one of {", ".join(known)}.'
+        raise CaptureError(f"[anatomy.landmarks] {message}", path=path)
     if len(set(named) & set(_TRAGIONS)) == 1:
-        raise CaptureError(
-            "[anatomy.landmarks] has only one of tragion_left and tragion_right. Give both or neither.",
-            path=capture.folder / "capture.toml",
-        )
+        message = "has only one of tragion_left and tragion_right. Give both or neither."
+        raise CaptureError(f"[anatomy.landmarks] {message}", path=path)
     meshes = load_meshes(capture) if meshes is None else meshes
     return _measured(capture.name, meshes, capture.fps, capture.anatomy.T_anatomical_skull, named)
 
@@ -289,10 +263,8 @@ def _measured(
         else:
             source = "from the scans"
             if landmark.startswith("condyle"):
-                means = (
-                    f"{MEAN_CONDYLES}{'' if tragions is None else ' from the tragions'}, as there is no mandible mesh"
-                )
-                source = means if bone is None else "from the mandible mesh"
+                means = MEAN_CONDYLES + ("" if tragions is None else " from the tragions")
+                source = f"{means}, as there is no mandible mesh" if bone is None else "from the mandible mesh"
             inferred.append(f"{landmark}, {source}")
     return Subject(name, T_anatomical_skull, landmarks, meshes, fps, inferred=tuple(inferred))
 

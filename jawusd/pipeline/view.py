@@ -26,12 +26,8 @@ if TYPE_CHECKING:
     from jawusd.viewer.server import Viewer
     from jawusd.viewer.viewed import ViewedActor, ViewedFootage
 
-#: Name under which the captured motion is listed among an actor's motions.
-CAPTURED = "captured take"
-
-#: Name of the file that describes a capture.
+CAPTURED = "captured take"  # name under which the captured motion is listed among an actor's motions
 CAPTURE_FILE = "capture.toml"
-
 _TRACKS, _BAKED = "tracks.npz", "anim_capture.usdc"
 _ANIMATION = re.compile(r"anim[A-Za-z0-9_-]{0,100}\.usd[ac]?")
 _MOST_FACES = 8_000  # maximum number of faces of a mesh; browsers without a GPU render it smoothly
@@ -54,8 +50,7 @@ def open_viewer(
         first: has served the page on the address so far.
 
     Raises:
-        MissingDependencyError: the viewer is not installed.
-        OutputError: the server cannot listen on the address.
+        MissingDependencyError, OutputError: the viewer is not installed, or cannot listen on the address.
     """
     from jawusd.viewer.server import Viewer
 
@@ -135,11 +130,7 @@ class ContactView:
         return ContactMap(self.teeth())
 
     def teeth(self) -> Teeth:
-        """Return both arches as solids.
-
-        Raises:
-            RigError: tooth contact cannot be computed from the rig's meshes.
-        """
+        """Return both arches as solids; raises RigError if the rig's meshes do not allow it."""
         from jawusd.pipeline.contact import teeth_of
         from jawusd.rig.geo import read_geometry
 
@@ -147,12 +138,7 @@ class ContactView:
 
     @explain_missing_packages()
     def draw(self, d: Array) -> NDArray[np.uint8]:
-        """Return an image, RGB (h, w, 3), of both arches at d (3,) [mm].
-
-        Raises:
-            RigError: tooth contact cannot be computed from the rig's meshes.
-            MissingDependencyError: a package is missing.
-        """
+        """Return an image, RGB (h, w, 3), of both arches at d (3,) [mm]; raises like `teeth`."""
         return self._map.draw(self._rig.pose(d))
 
 
@@ -182,9 +168,8 @@ def screen_meshes(path: Path, prim: str) -> dict[str, Mesh]:
 def part_of(mesh: Mesh, chosen: Mask) -> Mesh:
     """Return the faces of a mesh selected by a Boolean mask (F,), with the vertices that they use."""
     used, faces = np.unique(mesh.faces[chosen], return_inverse=True)
-    return Mesh(
-        mesh.vertices[used], faces.reshape(-1, 3).astype(np.int32), None if mesh.colors is None else mesh.colors[used]
-    )
+    colors = None if mesh.colors is None else mesh.colors[used]
+    return Mesh(mesh.vertices[used], faces.reshape(-1, 3).astype(np.int32), colors)
 
 
 def motion_names(folder: Path) -> tuple[str, ...]:
@@ -195,10 +180,6 @@ def motion_names(folder: Path) -> tuple[str, ...]:
 
 def load_motion(folder: Path, rig: JawRig, fps: float, name: str, *, prim: str | None = None) -> Clip:
     """Read one of the motions listed by `motion_names`, with its poses encoded as parameters.
-
-    Args:
-        fps: frame rate of the take.
-        prim: path of the rig's prim, if layers have several.
 
     Raises:
         FormatError: there is no such motion, or it cannot be read.
@@ -222,10 +203,7 @@ def load_motion(folder: Path, rig: JawRig, fps: float, name: str, *, prim: str |
 
 
 def save_motion(actor: Path, rig: JawRig, name: str, clip: Clip, overwrite: bool, *, prim: str | None = None) -> Path:
-    """Write a motion as an animation layer in the folder of an actor, or in that of a stage for one of its rigs.
-
-    Args:
-        name: file name without a folder, anim*.usda or anim*.usdc.
+    """Write a motion as the animation layer anim*.usda or anim*.usdc in the folder of an actor or stage.
 
     Raises:
         OutputError: the name is not allowed or taken, the rig ships with jawusd, or the file cannot be written.

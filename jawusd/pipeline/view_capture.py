@@ -52,11 +52,7 @@ def open_capture_viewer(
     *,
     allow_outside: bool = False,
 ) -> CaptureViewer:
-    """Serve a capture to browsers; parameters and errors as for `viewed_capture`.
-
-    Raises:
-        MissingDependencyError: the viewer is not installed.
-    """
+    """Serve a capture to browsers; parameters and errors as for `viewed_capture`."""
     from jawusd.viewer.capture_page import CaptureViewer
 
     return CaptureViewer(viewed_capture(path, tracks, progress, allow_outside=allow_outside), host, port)
@@ -70,7 +66,6 @@ def viewed_capture(
     Args:
         path: capture.toml or its folder.
         tracks: folder of a build of the capture, or tracks.npz; None: only the footage is shown.
-        allow_outside: allow paths in the capture that point outside its folder.
 
     Raises:
         FormatError: the capture or the tracks cannot be read, or the tracks use cameras that the capture lacks.
@@ -96,27 +91,17 @@ def viewed_capture(
     by_name = {camera.name: camera for camera in cameras}
     scans = {arch: meshes[f"{arch}_teeth"] for arch in ("upper", "lower")}
     wall = CameraWall(by_name, backdrops, poses, tuple(scans.values()), _tile_px(backdrops, poses is not None))
-    footage = _Footage(
-        capture=capture,
-        backdrops=backdrops,
-        wall=wall,
-        cameras=by_name,
-        offsets=offsets,
-        scans=scans,
-        tracks=poses,
-    )
+    footage = _Footage(capture, backdrops, wall, by_name, offsets, scans, poses)
     return ViewedCapture(
         name=capture.name,
         fps=capture.fps,
         frames=_frames(capture, poses, backdrops, offsets),
         offsets=offsets,
         sizes_px={name: backdrop.size_px for name, backdrop in backdrops.items()},
-        cameras=footage.cameras,
-        scans=footage.scans,
-        crowns={arch: crown_face_mask(mesh) for arch, mesh in footage.scans.items()},
-        labels={
-            arch: tooth_labels(mesh) if mesh.labels is None else mesh.labels for arch, mesh in footage.scans.items()
-        },
+        cameras=by_name,
+        scans=scans,
+        crowns={arch: crown_face_mask(mesh) for arch, mesh in scans.items()},
+        labels={arch: tooth_labels(mesh) if mesh.labels is None else mesh.labels for arch, mesh in scans.items()},
         T_anatomical_skull=subject_of_capture(capture, meshes).T_anatomical_skull,
         tracks=poses,
         picks=capture.bootstrap,
@@ -126,7 +111,7 @@ def viewed_capture(
         teeth_region=footage.teeth_region,
         poses_of_picks=footage.poses_of_picks,
         save_picks=partial(write_bootstrap, path / CAPTURE_FILE if path.is_dir() else path),
-        save_labels=partial(save_reviewed, own_scans, footage.scans),
+        save_labels=partial(save_reviewed, own_scans, scans),
     )
 
 
@@ -150,11 +135,8 @@ def _poses(capture: Capture, tracks: Path | None) -> Tracks | None:
 
 def _offsets(capture: Capture, build: Path | None, progress: Progress) -> dict[str, int]:
     """Return the frame offsets recorded by the build, or estimate them."""
-    if build is not None:
-        found = recorded_offsets(BuildState(build))
-        if found:
-            return found
-    return sync_cameras(capture, progress)["offsets"]
+    found = recorded_offsets(BuildState(build)) if build is not None else {}
+    return found or sync_cameras(capture, progress)["offsets"]
 
 
 def _frames(
@@ -165,11 +147,8 @@ def _frames(
         return int(poses.frames[0]), int(poses.frames[-1])
     if capture.frames is not None:
         return capture.frames[0], capture.frames[1] - 1
-    # frames from the first to the last image of any camera
-    return (
-        max(0, min(offsets[name] for name in backdrops)),
-        max(offsets[name] + backdrop.count - 1 for name, backdrop in backdrops.items()),
-    )
+    last = max(offsets[name] + backdrop.count - 1 for name, backdrop in backdrops.items())
+    return max(0, min(offsets[name] for name in backdrops)), last
 
 
 @dataclass(frozen=True, eq=False)
@@ -251,8 +230,7 @@ class _Footage:
 def take_footage(folder: Path, tile_px: tuple[int, int] = _TILE_PX) -> ViewedFootage | None:
     """Return the footage, or the masks, of the take from which a rig was built, in images of a size (width, height).
 
-    Returns None if the folder is not that of a build, or if a file of the build or the capture that it records cannot
-    be read, as after the rig was moved.
+    Returns None without a build, and if its files or its capture cannot be read, as after the rig was moved.
     """
     from jawusd.viewer.viewed import ViewedFootage
 
@@ -291,7 +269,6 @@ class _Take:
 
         Raises:
             CaptureError, CalibrationError: the footage or the calibration cannot be read.
-            MissingDependencyError: a package is missing.
         """
         from jawusd.media.overlay import placed_scans
 

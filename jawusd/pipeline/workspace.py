@@ -5,10 +5,10 @@ from __future__ import annotations
 import contextlib
 import os
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Generic, TypeVar
+from typing import Generic
 
 from jawusd.base.errors import CaptureError, JawusdError, OutputError
 from jawusd.base.guard import trim_memory
@@ -22,6 +22,8 @@ from jawusd.pipeline.state import (
     LOCK_FILE,
     BuildState,
     Progress,
+    R,
+    R_co,
     StageRecord,
     hash_files,
     hash_value,
@@ -32,11 +34,7 @@ from jawusd.pipeline.subject import BONES, TEETH
 
 
 def open_capture(capture: Capture | str | os.PathLike[str], *, allow_outside: bool = False) -> Capture:
-    """Return a capture, loading it from capture.toml or its folder if needed; see `formats.capture.load_capture`.
-
-    Args:
-        allow_outside: allow paths in the capture that point outside its folder.
-    """
+    """Return a capture, loading it from capture.toml or its folder if needed; see `formats.capture.load_capture`."""
     return capture if isinstance(capture, Capture) else load_capture(capture, allow_outside=allow_outside)
 
 
@@ -71,10 +69,7 @@ def input_files(capture: Capture, names: Iterable[str]) -> dict[str, list[Path]]
 def input_hashes(
     capture: Capture, names: Iterable[str], hashed: Callable[[list[Path]], str] = hash_files
 ) -> dict[str, str]:
-    """Return the content hash of each part of a capture; see `input_files`.
-
-    Args:
-        hashed: function that returns one hash of a list of files.
+    """Return the content hash of each part of a capture; `hashed` returns one hash of a list of files.
 
     Raises:
         CaptureError: a file cannot be read.
@@ -132,25 +127,14 @@ def _sequence_files(path: Path) -> list[Path]:
         return []
 
 
-R = TypeVar("R", bound=Mapping[str, object])
-R_co = TypeVar("R_co", bound=Mapping[str, object], covariant=True)
-
-
 @dataclass(frozen=True)
 class Stage(Generic[R_co]):
-    """One stage of a build.
+    """One stage of a build."""
 
-    Attributes:
-        name: name in build.json and in progress messages.
-        result: type of the stage's result in build.json.
-        seconds, seconds_per_picture: estimate for `--dry-run` on one core of 2.5 GHz, measured on two captures of three
-            cameras at 1280 x 720 and 1920 x 1080.
-    """
-
-    name: str
-    result: type[R_co]
-    seconds: float
-    seconds_per_picture: float = 0.0
+    name: str  # name in build.json and in progress messages
+    result: type[R_co]  # type of the stage's result in build.json
+    seconds: float  # estimate for `--dry-run` on one core of 2.5 GHz, measured on two captures of three cameras
+    seconds_per_picture: float = 0.0  # the same, for each image of 1280 x 720 to 1920 x 1080 pixels
 
 
 class StageMissing(Exception):
@@ -162,9 +146,6 @@ class Workspace:
 
     Attributes:
         capture: the capture, with the scan labels and the calibration from earlier stages.
-        folder: folder of the build.
-        state: the record of finished stages, build.json.
-        progress: called with (stage, done, total).
         reused: names of the stages that were reused.
     """
 
@@ -222,10 +203,7 @@ class Workspace:
         return self.state.finish(stage.name, inputs, outputs, time.perf_counter() - start, result)
 
     def _refuse_changes(self, stage: str) -> None:
-        """Raise an error if inputs of a stage were edited while it ran: it is unknown which version the stage has read.
-
-        Edits of capture.toml that change no value are ignored.
-        """
+        """Raise an error if inputs of a stage were edited while it ran: it is unknown which version was read."""
         changed = self._watch.changed()
         try:
             same = self._read_capture() == self._opened
@@ -251,12 +229,7 @@ class DryWorkspace(Workspace):
 def opened(
     folder: Path, read_capture: Callable[[], Capture], *, resume: bool, fresh: bool, progress: Progress
 ) -> Iterator[Workspace]:
-    """Open the folder of a build, and hold its lock for the duration of the context.
-
-    Args:
-        read_capture: function that reads the capture; called before the folder is created and after each stage.
-        resume: continue an earlier build in the folder.
-        fresh: delete an earlier build in the folder first.
+    """Open and lock the folder of a build; `read_capture` is called first, and again after each stage.
 
     Raises:
         OutputError: see `check_folder` and `state.locked`.
