@@ -20,12 +20,9 @@ _FEWEST = 3
 _OUTLIER = 2.8
 _ROUNDS = 100
 _SETTLED = 1e-9  # change of weights at which the iteration ends
-# Largest median distance of the points after the fit, in standard deviations: at most 2.2 in ten markings of each of 20
-# synthetic heads; at least 18 with the unit wrong by a factor of 10.
-_LARGEST_MEDIAN = 4.0
-# Minimum decrease of the sum of squares for left and right to count as exchanged: reached in all of the same 200
-# markings if exchanged, and in none if not.
-_EXCHANGED = 20.0
+# Largest median distance of the points after the fit, in standard deviations, and minimum decrease of the sum of
+# squares for left and right to count as exchanged. See docs/explanation/constants.md.
+_LARGEST_MEDIAN, _EXCHANGED = 4.0, 20.0
 # Smallest distance of the points from a line, relative to their standard deviation there: the rotation about the line
 # is then uncertain by 20 degrees.
 _LEAST_SPREAD = 3.0

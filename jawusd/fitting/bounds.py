@@ -40,8 +40,7 @@ _TAPER = 0.35  # fraction by which a frame at the edge of the window is moved to
 _KERNEL_KNOTS = 1.0  # standard deviation of the smoothing kernel over the opening, in knots
 _FOLDS, _BLOCK = 5, 50  # number of folds, and length of their blocks [frames], about that of one exercise
 # Margin of the hull. The soft maximum over all half-spaces exceeds the maximum by up to SOFTNESS_MM * log(DIRECTIONS +
-# 2) = 0.29 mm; with a margin below that, a section without extent (a parameter that the data do not excite) would be
-# empty.
+# 2) = 0.29 mm; with a smaller margin, the section of a parameter that the data do not excite would be empty.
 _MARGIN_MM = 0.38
 _CONTACT_TOLERANCE_MM = 0.05  # extension of the hull below the captured openings [mm]
 _FRAMES_PER_SLIP = 400  # because of noise, one in this many frames may lie beyond closed teeth
@@ -132,7 +131,8 @@ def _hull(d: Array, closed_mm: float | None) -> dict[str, Array]:
     low, high = closed + _MARGIN_MM - _CONTACT_TOLERANCE_MM, float(d[:, 0].max())
     knots = np.linspace(low, max(high, low + _SHORTEST_RANGE_MM), KNOTS)
     reach = d[:, 1:] @ directions.T
-    support = _smoothed(np.stack([_section(np.abs(d[:, 0] - knot) / _WINDOW_MM, reach) for knot in knots]))
+    support = np.stack([_section(np.abs(d[:, 0] - knot) / _WINDOW_MM, reach) for knot in knots])
+    support = np.asarray(gaussian_filter1d(support, _KERNEL_KNOTS, axis=0, mode="nearest", truncate=3.0))
     return {
         "slice_d1": knots,
         "slice_directions": directions,
@@ -153,7 +153,3 @@ def _section(distance: Array, reach: Array) -> Array:
     far = np.minimum(distance[near], 1.0)[:, None]
     middle = np.median(reach[near], axis=0)
     return (middle + (reach[near] - middle) * (1 - _TAPER * far**2)).max(0)
-
-
-def _smoothed(support: Array) -> Array:
-    return np.asarray(gaussian_filter1d(support, _KERNEL_KNOTS, axis=0, mode="nearest", truncate=3.0))

@@ -36,9 +36,8 @@ _SMALL_OPENING_MM, _SMALL_LATERAL_MM, _SMALL_PROTRUSION_MM = 30.0, 5.0, 4.0
 _WIDE, _FEW_WIDE_FRAMES = 0.85, 10
 _HALF_OPEN = (0.25, 0.65)  # fractions of the largest opening between which the mouth counts as half open
 _HALF_OPEN_SHARE = 0.35  # minimum fraction of the full range that should be reached with the mouth half open
-# Movements with the mouth half open: number of directions in the plane of laterotrusion and protrusion, distance from
-# the median (as a fraction of the range) beyond which a frame covers its direction, and minimum number of directions to
-# be covered.
+# Directions in the plane of laterotrusion and protrusion to be covered with the mouth half open: their number, the
+# distance from the median (as a fraction of the range) at which a frame covers one, and how many must be covered.
 _SECTORS, _SECTOR_REACH, _FEWEST_SECTORS = 8, 0.25, 6
 #: Distances along d1, d2 and d3 [mm]; a point of the bound farther from every captured pose lies in a gap.
 FAR_MM = np.array([3.0, 2.0, 2.0])

@@ -32,8 +32,7 @@ _TRIALS, _SAMPLE = 300, 15  # numbers of random samples and of their poses; each
 _CONSENSUS = 0.75  # minimum fraction of the poses that must agree with the quadratic map
 _REFITS = 3
 # Outlier thresholds: relative to the majority's spread, and absolute [mm, rms over the mandible]. A real jaw deviates
-# from the quadratic map by one or two millimetres at its borders; smaller failures are trimmed by the smooth models
-# themselves.
+# from the quadratic map by one or two millimetres; the models themselves trim smaller failures.
 _TIMES, _FLOOR_MM = 8.0, 6.0
 REASON = "far from the other poses' smooth motion"
 

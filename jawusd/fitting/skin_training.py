@@ -15,9 +15,7 @@ LEAST_FRAMES, MOST_FRAMES = 60, 300  # minimum number of frames with visible tee
 _BLOCKS = 6  # number of contiguous blocks that are held out in turn
 _LEAST_MOVED_MM = 0.5  # minimum standard deviation of each parameter in the training frames; 12 subjects have 1.4 mm
 _CHIN_POINTS = 3
-# Maximum ratio of the prediction error to that of each baseline. Observed: at most 0.4 for 12 subjects, at least 1.0
-# when face data are paired with the wrong frames.
-_MOST_SHARE = 0.65
+_MOST_SHARE = 0.65  # maximum ratio of the prediction error to that of each baseline; see docs/explanation/constants.md
 _NAMES = ("opening", "laterotrusion", "protrusion")
 
 
@@ -118,10 +116,9 @@ def on_bone(rig: JawRig, X: Array, poses: Array) -> tuple[Array, Array, Indices]
     """
     swing = transform_points(poses, rig.landmarks[:1])[:, 0]
     moved = X.mean(axis=1)
-    # The skin follows the incisal point, so the search starts from the rotation between the two point clouds (Kabsch
-    # 1976).
+    # The skin follows the incisal point, so the search starts from the rotation between the two point clouds.
     U, _, Vt = np.linalg.svd((swing - swing.mean(axis=0)).T @ (moved - moved.mean(axis=0)))
-    R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+    R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt  # Kabsch 1976
     start = make_transform(R, rig.landmarks[0] - R @ X.mean(axis=(0, 1)))
 
     def residual(unknown: Array, chosen: Indices) -> Array:

@@ -81,7 +81,7 @@ def check_capture(
     out: str | os.PathLike[str] | None = None,
     *,
     allow_outside: bool = False,
-    progress: Progress = no_progress,
+    progress: Progress | None = None,
 ) -> list[Finding]:
     """Return all errors and warnings that can be found in a capture within seconds; errors come first.
 
@@ -91,6 +91,7 @@ def check_capture(
         capture: the capture, its capture.toml or the folder of that file.
         out: folder in which the rig will be built, for the check of disk space; default: the capture's folder.
     """
+    progress = progress or no_progress
     findings: list[Finding] = []
     loaded: Capture | None
     if isinstance(capture, Capture):
@@ -198,7 +199,7 @@ def examine() -> Examined:
         "jawusd": __version__,
         "python": platform.python_version(),
         "system": platform.platform(),
-        "cores": _cores(),
+        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1,
         "memory_gb": round(machine_memory() / 1e9, 1) or None,
         "memory_limit_gb": round(memory_limit() / 1e9, 1),
         "versions": versions,
@@ -227,10 +228,6 @@ def _version(name: str) -> str:
         return version(name)
     except PackageNotFoundError:
         return ""
-
-
-def _cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _graphics() -> str:

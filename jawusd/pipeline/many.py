@@ -115,7 +115,10 @@ def build_many(captures: Sequence[ListedCapture], root: Path, options: ManyOptio
                     notify(line)
         finally:
             outcomes = [found.get(c.name, Outcome(c.name, str(c.path), STOPPED)) for c in captures]
-            _write(root, outcomes)
+            rows = [asdict(outcome) for outcome in outcomes]
+            text = json.dumps({"format": "jawusd-builds/1", "builds": rows}, indent=1)
+            write_text_atomic(root / SUMMARY_JSON, text + "\n")
+            write_csv_atomic(root / SUMMARY_CSV, [field.name for field in fields(Outcome)], rows)
     return outcomes
 
 
@@ -203,12 +206,6 @@ def _progress(run: str, name: str) -> Progress:
             worker.log_event(run, f"{name}: {stage} {done}/{total}" if total > 1 else f"{name}: {stage}")
 
     return report
-
-
-def _write(root: Path, outcomes: Sequence[Outcome]) -> None:
-    rows = [asdict(outcome) for outcome in outcomes]
-    write_text_atomic(root / SUMMARY_JSON, json.dumps({"format": "jawusd-builds/1", "builds": rows}, indent=1) + "\n")
-    write_csv_atomic(root / SUMMARY_CSV, [field.name for field in fields(Outcome)], rows)
 
 
 class _IgnoreInterrupt(WorkerPlugin):

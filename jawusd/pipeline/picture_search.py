@@ -22,9 +22,8 @@ from jawusd.segmentation.rows import Rows, tooth_rows
 _PART, _EVERY, _FEWEST = 240, 8, 8
 # Number of starts tried per part of the take for each of the four camera orientations.
 _TRIED = 3
-# Maximum number of starts tried, each of which takes 10 to 40 seconds of CPU time. If no start from any of three parts
-# of the take fits, the scans, the cameras or the detection are wrong, and more tries would not help. The limit is a
-# number, not a duration, so that results do not depend on the machine.
+# Maximum number of starts tried. If no start from three parts of the take fits, the scans, the cameras or the detection
+# are wrong. The limit is a number, not a duration, so that results do not depend on the machine.
 _MOST_TRIED = 36
 # Maximum fraction of the dividing line between the arches that may cross teeth for the arches to count as apart. In 64
 # images of eight mouths with smaller fractions, the arches were always separated correctly.
@@ -32,12 +31,9 @@ _MOST_BRIDGED = 0.1
 # Minimum length of the head's unit up vector projected to the image plane; a shorter one does not determine how the
 # image is turned.
 _SHORTEST_UP = 0.5
-# Limits of the fraction of the visible contour that matches the colours, with several cameras and with one. Starts
-# below the first are rejected. One above the second ends the search; others are compared with those of other frames
-# and orientations. With several cameras, correct starts of 15 subjects reach 0.31 to 0.58, and those in single frames
-# of one take 0.19 to 0.48. In images turned the wrong way, wrong starts reach 0.02 to 0.20. With one camera, lips count
-# as hiding the contour (`RigTracker.first_fit`): in 12 views of 8 subjects, correct starts reach 0.42 to 0.87, and
-# wrong ones 0.12 to 0.37.
+# Limits of the fraction of the visible contour that matches the colours, with several cameras and with one, for which
+# lips count as hiding the contour (`RigTracker.first_fit`). Starts below the first are rejected; one above the second
+# ends the search. See docs/explanation/constants.md.
 _LEAST_FIT, _CLEAR_FIT = (0.15, 0.4), (0.25, 0.6)
 
 T = TypeVar("T")

@@ -95,26 +95,28 @@ class _Segmentation:
         self._subject = subject_of_capture(capture, meshes)
         self._tracker = GuidedTracker(*self._meshes, self._see, len(self._config.reach_mm), executor=pool)
         self._first, self._stop = capture.frames or self._footage.range()
-        inputs = self._inputs(offsets, options.keys)
-        self._journal = Journal(folder, inputs, options.resume)
-        self._guide = known_guide(folder, inputs) if options.resume else {}
-        self._guide_inputs = inputs
+        self._inputs = self._hashed_inputs(options.keys)
+        self._journal = Journal(folder, self._inputs, options.resume)
+        self._guide = known_guide(folder, self._inputs) if options.resume else {}
         self._open: dict[int, _OpenFrame] = {}
         self._segmenters: dict[str, CameraSegmenter] = {}
 
-    def _inputs(self, offsets: dict[str, int], keys: Path | None) -> str:
-        drawn = (
-            {str(path.relative_to(keys)): hash_files([path]) for path in sorted(keys.rglob("*.png"))} if keys else {}
-        )
+    def _hashed_inputs(self, keys: Path | None) -> str:
+        drawn = {}
+        if keys is not None:
+            drawn = {str(path.relative_to(keys)): hash_files([path]) for path in sorted(keys.rglob("*.png"))}
         described = self._capture.model_dump(mode="json", include={"bootstrap", "frames", "calibration_unit_mm"})
         files = input_hashes(self._capture, ["videos", "teeth", "calibration"])
-        return hash_value([files, drawn, described, offsets])
+        return hash_value([files, drawn, described, self._offsets])
 
     def run(self) -> dict[int, FrameEntry]:
         """Segment all unfinished frames, and repeat all of them after learning from drawn masks."""
         start, poses = self._find_start()
-        if not self._guide:
-            self._follow(start, poses)
+        if not self._guide:  # follow the teeth through all frames by their colours
+            follower, search = self._follower()
+            follower.start_at(start, poses)
+            self._guide = follower.run(range(self._first, self._stop), search, self._progress)
+            save_guide(self._folder, self._inputs, self._guide)
         if start not in self._journal.entries:
             self._journal.drop(list(self._journal.entries))
             for path in (*state_files(self._folder), self._folder / LEARNED):
@@ -127,15 +129,8 @@ class _Segmentation:
         for step, end in ((1, self._stop), (-1, self._first - 1)):
             self._track_to(start, end, step)
         if keyed := self._keyed():
-            self._learn_and_repeat(keyed)
+            self._learn_and_repeat(start, keyed)
         return self._journal.entries
-
-    def _follow(self, start: int, poses: Array) -> None:
-        """Follow the teeth through all frames by their colours, starting from the poses in one frame."""
-        follower, search = self._follower()
-        follower.start_at(start, poses)
-        self._guide = follower.run(range(self._first, self._stop), search, self._progress)
-        save_guide(self._folder, self._guide_inputs, self._guide)
 
     def _find_start(self) -> tuple[int, Array]:
         """Return the start frame and its poses, shape (2, 4, 4), from picks or, without picks, from a search."""
@@ -144,14 +139,11 @@ class _Segmentation:
         if picks is not None:
             if picks.frame not in frames:
                 raise picks_outside(picks.frame, frames)
-            self._start = picks.frame
             return picks.frame, self._tracker.picked(picks, self._cameras)
         if self._journal.entries and self._guide:
-            self._start = next(iter(self._journal.entries))  # the first recorded frame is the start
-            return self._start, self._guide[self._start].poses
-        _, search = self._follower()
-        begin = search.run(frames, self._progress)
-        self._start = begin.frame
+            start = next(iter(self._journal.entries))  # the first recorded frame is the start
+            return start, self._guide[start].poses
+        begin = self._follower()[1].run(frames, self._progress)
         return begin.frame, begin.pose
 
     def _follower(self) -> tuple[Follower, PictureSearch[Array]]:
@@ -224,9 +216,9 @@ class _Segmentation:
             and LOST not in self._journal.entries[frame]["status"]
         ]
 
-    def _learn_and_repeat(self, keyed: Sequence[int]) -> None:
+    def _learn_and_repeat(self, start: int, keyed: Sequence[int]) -> None:
         """Learn colours and parameters from drawn masks, then segment all frames again at the known poses."""
-        self._new_segmenters(self._journal.known(self._start)[0])
+        self._new_segmenters(self._journal.known(start)[0])
         examples = []
         for frame in keyed:
             pictures, poses = self._footage.at(frame), self._journal.known(frame)[0]

@@ -83,7 +83,8 @@ def combine_guide(capture: Capture, tracks: Tracks, landmarks: Array) -> tuple[T
         )
         hint = "Run `jawusd segment` again, and keep its guide.npz beside the masks."
         return tracks, [Finding("footage_unchecked", "warning", message, path=str(folder / GUIDE), hint=hint)]
-    poses, covariance = np.full((len(tracks.frames), 2, 4, 4), np.nan), np.full((len(tracks.frames), 2, 6, 6), np.nan)
+    count = len(tracks.frames)
+    poses, covariance = np.full((count, 2, 4, 4), np.nan), np.full((count, 2, 6, 6), np.nan)
     for k in rows:
         shown = guide[int(tracks.frames[k])]
         poses[k, shown.found], covariance[k, shown.found] = shown.poses[shown.found], shown.covariance[shown.found]

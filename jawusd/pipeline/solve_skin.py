@@ -44,8 +44,7 @@ class SkinOfShot:
         """Read the map and the face data; `fps` is the frame rate of the shot [1/s].
 
         Raises:
-            FormatError: a file is invalid, the map belongs to another subject, or the face data have no frame rate or
-                other columns than the map.
+            FormatError: see `load_own_skin` and `read_shot_face`.
         """
         self._skin = load_own_skin(rig, options.skin)
         self._fps, self._face = fps, options.face
@@ -58,13 +57,7 @@ class SkinOfShot:
         return range(max(ceil(first), 0), max(floor(last) + 1, 0))
 
     def __call__(self, frames: Array, d: Array, seen: Mask, heads: Array | None = None) -> SkinJaw:
-        """Return the jaw parameters estimated from skin in some frames.
-
-        Args:
-            frames: frame numbers of the shot, shape (F,).
-            d: jaw parameters [mm], shape (F, 3).
-            seen: frames in which d was measured, shape (F,).
-            heads: not used, since the face is relative to the head.
+        """Return the jaw parameters estimated from skin in some frames; see `tracking.performance.skin.SkinOf`.
 
         Raises:
             FittingError: the offset between the clocks is unknown and cannot be estimated, no frame has a familiar

@@ -121,9 +121,11 @@ def _cameras(
     if boards and not by_name:
         listed = ", ".join(f"{names[clip]}: {board}" for clip, board in boards.items())
         out.notes.append(f"the names do not show which camera each board clip belongs to; matched in order ({listed})")
-    cameras = [
-        CameraSketch(names[clip], clip, board=boards.get(clip), remark=_remark(video)) for clip, video in opened.items()
-    ]
+    cameras = []
+    for clip, video in opened.items():
+        size = f"{video.size_px[0]} x {video.size_px[1]} px"
+        remark = f"{size}, {video.count} frames, {video.timeline.rate:.5g} fps"
+        cameras.append(CameraSketch(names[clip], clip, board=boards.get(clip), remark=remark))
     cameras = with_masks(cameras, files.masks)
     for camera in cameras:
         masks = ", masks" if camera.masks else ""
@@ -148,11 +150,6 @@ def _opened(folder: Path, clips: Sequence[PurePath], out: CaptureStart) -> dict[
         except JawusdError as error:
             out.notes.append(f"{clip} is skipped: {error.statement().rstrip('.')}")
     return found
-
-
-def _remark(video: Clip) -> str:
-    width, height = video.size_px
-    return f"{width} x {height} px, {video.count} frames, {video.timeline.rate:.5g} fps"
 
 
 def _rate(opened: Mapping[PurePath, Clip], out: CaptureStart) -> float | None:

@@ -240,11 +240,7 @@ def locked(folder: Path) -> Iterator[None]:
 
 
 def _lock(handle: int, folder: Path) -> bool:
-    """Lock an open file; return False, with a warning, if the file system has no locks.
-
-    Raises:
-        OutputError: another process holds the lock.
-    """
+    """Lock an open file, or raise OutputError; return False, with a warning, if the file system has no locks."""
     deadline = time.monotonic() + _ENDING_S
     while True:
         try:

@@ -29,8 +29,7 @@ if TYPE_CHECKING:
 TEETH = {"upper": "upper_teeth", "lower": "lower_teeth"}
 
 # Fraction of the crown border that follows no crease, above which the labels need review. Of 58 synthetic scans, the 51
-# with a mean border error below 0.3 mm are below it; plaster casts of patients reach 0.07 to 0.11, a cast without teeth
-# 0.77.
+# with a mean border error below 0.3 mm are below it; plaster casts reach 0.07 to 0.11, a cast without teeth 0.77.
 _WEAK_SHARE = 0.15
 # Facial landmarks that place the condyles of a subject without a mandible mesh.
 _TRAGIONS = ("tragion_left", "tragion_right")

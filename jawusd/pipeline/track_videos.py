@@ -5,6 +5,7 @@ The teeth are followed from a start frame to both ends of the take. Where they a
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from functools import partial
@@ -135,28 +136,22 @@ class Follower:
 
     def _walk(self, tracker: RegionTracker, cutter: Cutter, way: range, near: RegionPose) -> Iterator[RegionPose]:
         """Yield the poses of frames in tracking order, starting next to a given pose; keep the views of some frames."""
-        cuts = _Latest(cutter.walk(self._footage, way))
-        for frame, found in zip(way, tracker.follow(cuts, near.poses), strict=True):
+        latest = deque[Cut](maxlen=1)  # `itertools.tee` would keep up to 57 items in memory
+
+        def cuts() -> Iterator[Cut]:
+            for cut in cutter.walk(self._footage, way):
+                latest.append(cut)
+                yield cut
+
+        for frame, found in zip(way, tracker.follow(cuts(), near.poses), strict=True):
             if frame in self._wanted and found.found.all():
                 self._wanted.remove(frame)
-                self.sampled_views.append((found.poses, tracker.views(cuts.latest(found.poses), found.poses)))
+                self.sampled_views.append((found.poses, tracker.views(latest[0](found.poses), found.poses)))
             yield found
 
 
-class _Latest(Iterator["Cut"]):
-    """An iterator that stores only its last item; `itertools.tee` would keep up to 57 items in memory."""
-
-    def __init__(self, cuts: Iterator[Cut]) -> None:
-        self._cuts = cuts
-
-    def __next__(self) -> Cut:
-        self.latest = next(self._cuts)
-        return self.latest
-
-
-# Minimum fraction of the visible contour that matches the colours for picks to be accepted. Six path-traced mouths
-# reached 0.26 to 0.5, and three dark, noisy or colourless ones 0.13 to 0.27 with errors up to 0.3 mm. A focal length
-# wrong by 15 % gave 0.05, and another subject's lower scan 0.08 and 0.12, with errors above 1 mm.
+# Minimum fraction of the visible contour that matches the colours for picks to be accepted. Nine path-traced mouths,
+# dark and noisy ones included, reached 0.13 to 0.5; a wrong focal length or another subject's scan gave 0.05 to 0.12.
 _LEAST_PICKED_FIT = 0.1
 
 

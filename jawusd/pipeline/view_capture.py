@@ -6,7 +6,7 @@ import os
 import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -248,42 +248,35 @@ def take_footage(folder: Path, tile_px: tuple[int, int] = _TILE_PX) -> ViewedFoo
     if not names or not set(names) <= set(offsets) or not len(tracks.frames):
         return None
     frames = int(tracks.frames[0]), int(tracks.frames[-1])
-    return ViewedFootage(tuple(names), frames, _Take(facts.capture, offsets, tracks, tile_px).picture)
+    return ViewedFootage(tuple(names), frames, _outlines(facts.capture, offsets, tracks, tile_px))
 
 
-class _Take:
-    """Draws the images of a take, cropped to the teeth, with outlines of the tracked teeth; thread-safe."""
+def _outlines(
+    capture: Capture, offsets: dict[str, int], tracks: Tracks, tile_px: tuple[int, int]
+) -> Callable[[str, int], NDArray[np.uint8]]:
+    """Return a thread-safe function that draws a camera's image, cropped to the teeth, with their outlines."""
+    lock = threading.Lock()
 
-    def __init__(self, capture: Capture, offsets: dict[str, int], tracks: Tracks, tile_px: tuple[int, int]) -> None:
-        self._capture, self._offsets, self._tracks, self._tile_px = capture, offsets, tracks, tile_px
-        self._walls: dict[str, CameraWall] = {}
-        self._lock = threading.Lock()
+    @cache
+    def scans() -> tuple[Mesh, Mesh]:
+        return tracked_scans(capture, tracks)
 
-    @cached_property
-    def _scans(self) -> tuple[Mesh, Mesh]:
-        return tracked_scans(self._capture, self._tracks)
-
-    @explain_missing_packages()
-    def picture(self, name: str, frame: int) -> NDArray[np.uint8]:
-        """Return a camera's image at a frame of the reference camera, RGB (h, w, 3); files are opened on first use.
-
-        Raises:
-            CaptureError, CalibrationError: the footage or the calibration cannot be read.
-        """
-        from jawusd.media.overlay import placed_scans
-
-        with self._lock:
-            wall = self._walls.get(name) or self._opened(name)
-        row = self._tracks.row_of(frame)
-        scans = [] if row is None else placed_scans(self._tracks, row, self._scans)
-        return wall.draw(frame, scans, fill=0.0)
-
-    def _opened(self, name: str) -> CameraWall:
+    @cache
+    def wall(name: str) -> CameraWall:
         from jawusd.media.side_by_side import CameraWall
 
-        source = next(source for source in self._capture.cameras if source.name == name)
-        one = self._capture.model_copy(update={"cameras": (source,)})
-        cameras = {camera.name: camera for camera in tracked_cameras(load_cameras(self._capture), self._tracks)}
-        backdrops = open_backdrops(one, self._offsets)
-        self._walls[name] = CameraWall({name: cameras[name]}, backdrops, self._tracks, self._scans, self._tile_px)
-        return self._walls[name]
+        sources = tuple(source for source in capture.cameras if source.name == name)
+        cameras = {camera.name: camera for camera in tracked_cameras(load_cameras(capture), tracks)}
+        backdrops = open_backdrops(capture.model_copy(update={"cameras": sources}), offsets)
+        return CameraWall({name: cameras[name]}, backdrops, tracks, scans(), tile_px)
+
+    @explain_missing_packages()
+    def picture(name: str, frame: int) -> NDArray[np.uint8]:
+        from jawusd.media.overlay import placed_scans
+
+        with lock:
+            opened = wall(name)
+        row = tracks.row_of(frame)
+        return opened.draw(frame, [] if row is None else placed_scans(tracks, row, scans()), fill=0.0)
+
+    return picture
