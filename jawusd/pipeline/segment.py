@@ -27,7 +27,7 @@ from jawusd.pipeline.track_videos import Follower
 from jawusd.pipeline.workspace import input_hashes
 from jawusd.segmentation.camera import CameraSegmenter, Segment
 from jawusd.segmentation.colours import ColourStates, SegmentationConfig, state_files
-from jawusd.segmentation.files import KeyMasks, mask_path, write_mask
+from jawusd.segmentation.files import ARCHES, KeyMasks, mask_path, write_mask
 from jawusd.segmentation.learn import learn_numbers
 from jawusd.segmentation.picture import Pictures
 from jawusd.tracking.contour.frame_record import FrameRecord, FrameSummary
@@ -35,8 +35,6 @@ from jawusd.tracking.contour.quality import view_residual_px
 from jawusd.tracking.contour.views import View
 from jawusd.tracking.region.picture_start import ArchStart
 from jawusd.tracking.sequence.guided import GuidedTracker
-
-ARCHES = ("upper", "lower")
 
 
 @dataclass(frozen=True)
