@@ -47,7 +47,7 @@ class PaperScan:
     vertices: Array  # scan coordinates [mm], shape (V, 3)
     plain_faces: NDArray[np.int32]  # red: parts of teeth that only have to cover the mask, shape (F, 3)
     boundary_faces: NDArray[np.int32]  # green: the boundary of interest, shape (B, 3)
-    cull: bool  # whether back faces may be culled
+    cull: bool  # whether to cull back faces, which halves the time; needs faces counter-clockwise seen from outside
     centre: Array  # centroid of the teeth [mm], shape (3,)
 
 
@@ -97,13 +97,7 @@ class PaperEnergy:
     """
 
     def __init__(self, counter: PixelCounter, scan: PaperScan, boundary_weight: float) -> None:
-        """Combine a counter with the weight of the boundary term.
-
-        Args:
-            counter: renderer of the scan.
-            scan: the scan.
-            boundary_weight: lambda of eq. 7.
-        """
+        """Combine a renderer of the scan with lambda of eq. 7, the weight of the boundary term."""
         self._counter, self._scan, self._weight = counter, scan, boundary_weight
         self.evaluations = 0
 
@@ -184,32 +178,15 @@ def _count(
 
 
 class RasterCounter:
-    """CPU pixel counter based on the bit-row rasteriser; use it as a context manager, or close it."""
+    """CPU pixel counter based on the bit-row rasteriser; the counts do not depend on the number of threads."""
 
-    def __init__(
-        self,
-        vertices: Array,
-        plain_faces: NDArray[np.int32],
-        boundary_faces: NDArray[np.int32],
-        *,
-        cull: bool = False,
-        threads: int = 1,
-    ) -> None:
-        """Store the parts of the scan that are rendered.
-
-        Args:
-            vertices: scan coordinates [mm], shape (V, 3).
-            plain_faces: teeth without the boundary of interest (red in the paper's fig. 8), shape (F, 3).
-            boundary_faces: the boundary of interest (green), shape (B, 3).
-            cull: whether to cull back faces, which halves the time; all faces must be counter-clockwise seen from
-                outside.
-            threads: number of worker threads; the counts do not depend on this number.
-        """
-        used, index = np.unique(np.concatenate([plain_faces, boundary_faces]), return_inverse=True)
+    def __init__(self, scan: PaperScan, threads: int = 1) -> None:
+        plain = len(scan.plain_faces)
+        used, index = np.unique(np.concatenate([scan.plain_faces, scan.boundary_faces]), return_inverse=True)
         faces = np.ascontiguousarray(index.reshape(-1, 3), np.int32)
-        self._vertices = np.ascontiguousarray(vertices[used], np.float32)
-        self._plain, self._boundary = faces[: len(plain_faces)], faces[len(plain_faces) :]
-        self._cull, self._threads = cull, threads
+        self._vertices = np.ascontiguousarray(scan.vertices[used], np.float32)
+        self._plain, self._boundary = faces[:plain], faces[plain:]
+        self._cull, self._threads = scan.cull, threads
         self._pool = ThreadPoolExecutor(threads) if threads > 1 else None
 
     def show(self, matrices: Array, masks: Mask, free: Mask) -> None:
@@ -247,17 +224,6 @@ class RasterCounter:
 
         list((self._pool.map if self._pool else map)(part, range(self._threads)))
         return counts.reshape(len(poses), -1, 2)
-
-    def close(self) -> None:
-        """Shut down the worker threads."""
-        if self._pool:
-            self._pool.shutdown()
-
-    def __enter__(self) -> RasterCounter:
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self.close()
 
 
 def checked_screens(matrices: Array, masks: Mask, free: Mask) -> None:

@@ -6,16 +6,14 @@ from those of the CPU where a pixel centre lies within rounding error of a trian
 
 from __future__ import annotations
 
-import contextlib
 from dataclasses import dataclass
-from typing import Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from jawusd.base.arrays import Array, Mask
 from jawusd.base.errors import JawusdError, MissingDependencyError
-from jawusd.paper.energy import checked_screens
+from jawusd.paper.energy import PaperScan, checked_screens
 
 try:
     import moderngl
@@ -116,13 +114,6 @@ def describe_graphics() -> str:
         context.release()
 
 
-class _Releasable(Protocol):
-    def release(self) -> None: ...
-
-
-Resource = TypeVar("Resource", bound=_Releasable)
-
-
 @dataclass(frozen=True, eq=False)
 class _Target:
     """A layered render target."""
@@ -136,42 +127,29 @@ class _Target:
 
 
 class GlCounter:
-    """Pixel counter on the GPU; use it as a context manager, or close it.
+    """Pixel counter on the GPU; releasing the context frees its memory.
 
     Counters may share a context. All calls must come from the thread that opened the context.
     """
 
-    def __init__(
-        self,
-        context: moderngl.Context,
-        vertices: Array,
-        plain_faces: NDArray[np.int32],
-        boundary_faces: NDArray[np.int32],
-        *,
-        cull: bool = False,
-    ) -> None:
-        """Upload the scan to a context opened by `open_context`; the other arguments are those of `RasterCounter`."""
+    def __init__(self, context: moderngl.Context, scan: PaperScan) -> None:
+        """Upload the scan to a context opened by `open_context`."""
         self._gl = context
-        self._flags = moderngl.CULL_FACE if cull else moderngl.NOTHING
-        self._stack = contextlib.ExitStack()
-        self._program = self._own(context.program(vertex_shader=_VERTEX, fragment_shader=_FRAGMENT))
-        self._compute = self._own(context.compute_shader(_COUNT))
+        self._flags = moderngl.CULL_FACE if scan.cull else moderngl.NOTHING
+        self._program = context.program(vertex_shader=_VERTEX, fragment_shader=_FRAGMENT)
+        self._compute = context.compute_shader(_COUNT)
         self._compute["drawn"], self._compute["masks"] = 0, 1
-        buffer = self._own(context.buffer(np.ascontiguousarray(vertices, np.float32)))
+        buffer = context.buffer(np.ascontiguousarray(scan.vertices, np.float32))
         # The boundary is drawn after the other teeth and overwrites them, so no depth buffer is needed.
         self._passes = []
-        for shade, faces in ((0.5, plain_faces), (1.0, boundary_faces)):
+        for shade, faces in ((0.5, scan.plain_faces), (1.0, scan.boundary_faces)):
             if len(faces):
-                index = self._own(context.buffer(np.ascontiguousarray(faces, np.int32)))
+                index = context.buffer(np.ascontiguousarray(faces, np.int32))
                 array = context.vertex_array(self._program, [(buffer, "3f", "position")], index)
-                self._passes.append((shade, self._own(array)))
+                self._passes.append((shade, array))
         self._targets: dict[int, _Target] = {}
         self._masks: moderngl.TextureArray | None = None
         self._most_layers = int(context.info["GL_MAX_ARRAY_TEXTURE_LAYERS"])
-
-    def _own(self, resource: Resource) -> Resource:
-        self._stack.callback(resource.release)
-        return resource
 
     def show(self, matrices: Array, masks: Mask, free: Mask) -> None:
         """Set the masks of one frame; the arguments are those of `RasterCounter.show`.
@@ -211,9 +189,8 @@ class GlCounter:
 
     def _count_part(self, poses: Array) -> NDArray[np.int64]:
         width, height, views = self._shown().size
-        clip = np.einsum(
-            "cij,njk->ncki", self._to_clip, poses
-        )  # transposed, since OpenGL stores matrices column by column
+        # transposed, since OpenGL stores matrices column by column
+        clip = np.einsum("cij,njk->ncki", self._to_clip, poses)
         layers = len(poses) * views
         matrices = self._gl.buffer(np.ascontiguousarray(clip, np.float32))
         counts = self._gl.buffer(np.zeros(2 * layers, np.uint32))
@@ -257,14 +234,3 @@ class GlCounter:
         if self._masks is not None:
             self._masks.release()
             self._masks = None
-
-    def close(self) -> None:
-        """Free the device memory; the context stays open."""
-        self._drop_textures()
-        self._stack.close()
-
-    def __enter__(self) -> GlCounter:
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self.close()

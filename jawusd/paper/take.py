@@ -124,7 +124,7 @@ def _start_poses(bootstrap: Bootstrap, cameras: Mapping[str, Camera], meshes: tu
 def _energies(
     scans: Sequence[PaperScan], config: PaperConfig, backend: Backend, threads: int, stack: ExitStack
 ) -> list[PaperEnergy]:
-    """Return the energies of both arches; closing the exit stack frees their resources."""
+    """Return the energies of both arches; closing the exit stack releases the OpenGL context."""
     counters: list[PixelCounter]
     if backend == "gl":
         # Imported here because the module requires moderngl, which the CPU backend does not need.
@@ -132,17 +132,9 @@ def _energies(
 
         context = open_context()
         stack.callback(context.release)
-        counters = [
-            stack.enter_context(GlCounter(context, s.vertices, s.plain_faces, s.boundary_faces, cull=s.cull))
-            for s in scans
-        ]
+        counters = [GlCounter(context, scan) for scan in scans]
     else:
-        counters = [
-            stack.enter_context(
-                RasterCounter(s.vertices, s.plain_faces, s.boundary_faces, cull=s.cull, threads=threads)
-            )
-            for s in scans
-        ]
+        counters = [RasterCounter(scan, threads) for scan in scans]
     return [PaperEnergy(counter, scan, config.boundary_weight) for counter, scan in zip(counters, scans, strict=True)]
 
 

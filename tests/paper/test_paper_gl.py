@@ -9,7 +9,7 @@ import pytest
 from jawusd.base.errors import MissingDependencyError
 from jawusd.geometry import make_transform, se3_exp
 from jawusd.meshes import raster
-from jawusd.paper.energy import RasterCounter
+from jawusd.paper.energy import PaperScan, RasterCounter
 
 moderngl = pytest.importorskip("moderngl", reason="moderngl is not installed")
 gl = importlib.import_module("jawusd.paper.gl")
@@ -33,6 +33,10 @@ def torus(rings: int = 60, sides: int = 30) -> tuple[np.ndarray, np.ndarray]:
 VERTICES, FACES = torus()
 IS_BOUNDARY = VERTICES[FACES[:, 0], 1] > 8
 PLAIN, BOUNDARY = FACES[~IS_BOUNDARY], FACES[IS_BOUNDARY]
+
+
+def scan(plain: np.ndarray = PLAIN, boundary: np.ndarray = BOUNDARY, *, cull: bool = False) -> PaperScan:
+    return PaperScan(VERTICES, plain, boundary, cull, np.zeros(3))
 
 
 def matrices() -> np.ndarray:
@@ -79,9 +83,9 @@ def context():
 def test_the_cpu_counts_what_numpy_counts() -> None:
     P, masks, free = screens()
     poses = some_poses(5)
-    with RasterCounter(VERTICES, PLAIN, BOUNDARY) as counter:
-        counter.show(P, masks, free)
-        found = counter.counts(poses)
+    counter = RasterCounter(scan())
+    counter.show(P, masks, free)
+    found = counter.counts(poses)
     assert found.shape == (5, VIEWS, 2)
     for n, pose in enumerate(poses):
         for c, m in enumerate(P):
@@ -96,9 +100,9 @@ def test_threads_and_culling_leave_the_silhouette_of_a_solid_alone(options) -> N
     poses = some_poses(7)
     results = []
     for chosen in ({}, options):
-        with RasterCounter(VERTICES, PLAIN, BOUNDARY, **chosen) as counter:
-            counter.show(P, masks, free)
-            results.append(counter.counts(poses))
+        counter = RasterCounter(scan(cull=chosen.get("cull", False)), chosen.get("threads", 1))
+        counter.show(P, masks, free)
+        results.append(counter.counts(poses))
     np.testing.assert_array_equal(results[0][..., 0], results[1][..., 0])
     if "cull" not in options:  # the far side of the boundary may lie outside the mask
         np.testing.assert_array_equal(results[0], results[1])
@@ -109,49 +113,47 @@ def test_threads_and_culling_leave_the_silhouette_of_a_solid_alone(options) -> N
 def test_opengl_agrees_with_the_cpu(context, cull) -> None:
     P, masks, free = screens()
     poses = some_poses(20)
-    with RasterCounter(VERTICES, PLAIN, BOUNDARY, cull=cull) as cpu:
-        cpu.show(P, masks, free)
-        expected = cpu.counts(poses)
-    with gl.GlCounter(context, VERTICES, PLAIN, BOUNDARY, cull=cull) as counter:
-        counter.show(P, masks, free)
-        found = counter.counts(poses)
-        assert np.abs(found - expected).max() <= EDGE_TIES_PX
-        assert expected.max() > 100 * EDGE_TIES_PX
-        assert context.error is not None  # clears it: making a framebuffer, moderngl binds the one released before
-        # Counts are the same for single poses and batches.
-        np.testing.assert_array_equal(np.concatenate([counter.counts(pose[None]) for pose in poses]), found)
+    cpu = RasterCounter(scan(cull=cull))
+    cpu.show(P, masks, free)
+    expected = cpu.counts(poses)
+    counter = gl.GlCounter(context, scan(cull=cull))
+    counter.show(P, masks, free)
+    found = counter.counts(poses)
+    assert np.abs(found - expected).max() <= EDGE_TIES_PX
+    assert expected.max() > 100 * EDGE_TIES_PX
+    assert context.error is not None  # clears it: making a framebuffer, moderngl binds the one released before
+    # Counts are the same for single poses and batches.
+    np.testing.assert_array_equal(np.concatenate([counter.counts(pose[None]) for pose in poses]), found)
     assert context.error == "GL_NO_ERROR"
 
 
 def test_opengl_splits_what_is_too_much_for_one_drawing(context, monkeypatch) -> None:
     P, masks, free = screens()
     poses = some_poses(9)
-    with gl.GlCounter(context, VERTICES, PLAIN, BOUNDARY) as counter:
+    counter = gl.GlCounter(context, scan())
+    counter.show(P, masks, free)
+    whole = counter.counts(poses)
+    monkeypatch.setattr(gl, "_MOST_PIXELS", 256 * 192 * 2 * VIEWS)  # two poses at a time
+    np.testing.assert_array_equal(counter.counts(poses), whole)
+    monkeypatch.setattr(gl, "_MOST_PIXELS", 256 * 192)
+    with pytest.raises(ValueError, match="exceed the maximum size of a texture"):
         counter.show(P, masks, free)
-        whole = counter.counts(poses)
-        monkeypatch.setattr(gl, "_MOST_PIXELS", 256 * 192 * 2 * VIEWS)  # two poses at a time
-        np.testing.assert_array_equal(counter.counts(poses), whole)
-        monkeypatch.setattr(gl, "_MOST_PIXELS", 256 * 192)
-        with pytest.raises(ValueError, match="exceed the maximum size of a texture"):
-            counter.show(P, masks, free)
 
 
 def test_counters_share_a_context_and_take_pictures_of_changing_size(context) -> None:
     P, masks, free = screens()
     pose = some_poses(1)
-    with (
-        gl.GlCounter(context, VERTICES, PLAIN, BOUNDARY) as first,
-        gl.GlCounter(context, VERTICES, FACES, np.empty((0, 3), np.int32)) as second,
-        RasterCounter(VERTICES, PLAIN, BOUNDARY) as cpu,
-    ):
-        for views, width, height in ((3, 200, 130), (2, 70, 60), (1, 130, 129), (3, 200, 130)):
-            part = (P[:views], masks[:views, :height, :width], free[:views, :height, :width])
-            for counter in (first, second, cpu):
-                counter.show(*part)
-            expected = cpu.counts(pose)
-            assert np.abs(first.counts(pose) - expected).max() <= EDGE_TIES_PX
-            assert np.abs(second.counts(pose)[..., 0] - expected[..., 0]).max() <= EDGE_TIES_PX
-            assert not second.counts(pose)[..., 1].any()
+    first = gl.GlCounter(context, scan())
+    second = gl.GlCounter(context, scan(FACES, np.empty((0, 3), np.int32)))
+    cpu = RasterCounter(scan())
+    for views, width, height in ((3, 200, 130), (2, 70, 60), (1, 130, 129), (3, 200, 130)):
+        part = (P[:views], masks[:views, :height, :width], free[:views, :height, :width])
+        for counter in (first, second, cpu):
+            counter.show(*part)
+        expected = cpu.counts(pose)
+        assert np.abs(first.counts(pose) - expected).max() <= EDGE_TIES_PX
+        assert np.abs(second.counts(pose)[..., 0] - expected[..., 0]).max() <= EDGE_TIES_PX
+        assert not second.counts(pose)[..., 1].any()
 
 
 @pytest.mark.parametrize("change", ["matrices", "masks", "free", "empty"])
@@ -165,8 +167,8 @@ def test_wrong_shapes_are_refused(change) -> None:
         free = free[:, :-1]
     else:
         masks = free = masks[:, :0]
-    with RasterCounter(VERTICES, PLAIN, BOUNDARY) as counter, pytest.raises(ValueError, match="masks must be|free"):
-        counter.show(P, masks, free)
+    with pytest.raises(ValueError, match="masks must be|free"):
+        RasterCounter(scan()).show(P, masks, free)
 
 
 def test_no_driver_is_one_clear_error(monkeypatch) -> None:

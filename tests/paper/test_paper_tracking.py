@@ -66,10 +66,9 @@ def shifted(x_mm: float, y_mm: float) -> np.ndarray:
 
 def energy_of(views, poses, row=0, other_row_hides=False):
     scan = paper_scan(plate(), "upper")
-    with RasterCounter(scan.vertices, scan.plain_faces, scan.boundary_faces, cull=scan.cull) as counter:
-        energy = PaperEnergy(counter, scan, LAMBDA)
-        energy.show(views, row, np.eye(4), other_row_hides)
-        return energy(np.stack(poses)), [energy.uncovered_px(pose) for pose in poses]
+    energy = PaperEnergy(RasterCounter(scan), scan, LAMBDA)
+    energy.show(views, row, np.eye(4), other_row_hides)
+    return energy(np.stack(poses)), [energy.uncovered_px(pose) for pose in poses]
 
 
 def test_the_energy_is_white_pixels_plus_lambda_times_dark_green_ones() -> None:
