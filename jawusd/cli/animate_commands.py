@@ -212,13 +212,7 @@ def read_face(rig: JawRig, source: Path, fps: float | None, mapping: Path | None
     """Read the jaw motion of an ARKit face capture, by the subject's map or as fractions of the ranges of motion.
 
     Without a mapping, JawOpen = 1 is the full opening, and (JawLeft - JawRight) and JawForward are fractions of the
-    ranges of motion at the current opening. Left is the subject's left.
-
-    Args:
-        source: CSV of Live Link Face.
-        fps: frame rate of the motion [1/s]; None: the rate of the time codes.
-        mapping: file written by `jawusd arkit-fit`, or by `jawusd skin-fit` from blend shapes of this app; None: use
-            fractions of the ranges of motion.
+    ranges of motion at the current opening. Left is the subject's left. Without `fps`, the time codes give the rate.
 
     Raises:
         FormatError: the file is invalid or has no row with a face, or the mapping belongs to another subject.

@@ -240,11 +240,7 @@ def segment(
 
 
 def _refuse_masks(folder: Path, record: Path, force: bool) -> None:
-    """Check that a folder for masks is empty, unless forced: it may contain hand-drawn masks.
-
-    Raises:
-        OutputError: the folder is not empty.
-    """
+    """Check that a folder for masks is empty, unless forced: it may contain hand-drawn masks."""
     from jawusd.base.errors import OutputError
 
     if force or not folder.exists() or not any(folder.iterdir()):

@@ -94,11 +94,7 @@ def _report(error: JawusdError, cause: BaseException | None = None) -> int:
 
 
 def _unwritable(error: OSError | RuntimeError) -> int:
-    """Print an error raised outside any command, such as a full disk or an invalid file name; return the exit code.
-
-    Raises:
-        RuntimeError: the error is of another kind.
-    """
+    """Print an error raised outside any command, such as a full disk or an invalid file name; return the exit code."""
     if isinstance(error, OSError):
         message = f"{str(error.filename or 'the output'):.200}: {error.strerror or error}."
     elif str(error).startswith("Symlink loop"):  # Path.resolve raises RuntimeError for circular links

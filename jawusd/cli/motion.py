@@ -58,10 +58,7 @@ class AuthoredMotion:
 
 
 def read_motion(rig: JawRig, source: Path) -> AuthoredMotion:
-    """Read a motion given as key frames, d or poses; keys are interpolated at every whole frame, poses encoded as d.
-
-    Args:
-        source: keys.json, or a CSV or JSON table of d or of poses.
+    """Read key frames, or a table of d or poses; keys are interpolated at every whole frame, poses encoded as d.
 
     Raises:
         FormatError: the file is invalid.
@@ -235,10 +232,6 @@ def carried_over(
 ) -> tuple[AuthoredMotion, Changes]:
     """Read a motion of one rig and retarget it to another; see `pipeline.library.retarget`.
 
-    Args:
-        source: an animation layer, key frames, or a table of d values or poses.
-        prim: path of the rig's prim, if the source is a stage with several.
-
     Raises:
         FormatError: the motion or a rig cannot be read.
         EvaluatorError: no frame of the motion has parameters.
@@ -283,14 +276,10 @@ def _motion_of(rig: JawRig, path: Path, prim: str | None) -> AuthoredMotion:
 
 
 def resampled(rig: JawRig, motion: AuthoredMotion, source_fps: float, fps: float) -> AuthoredMotion:
-    """Resample a motion at the whole frames of a different frame rate; frame 0 stays frame 0.
+    """Resample a motion at the whole frames of a different frame rate [1/s]; frame 0 stays frame 0.
 
     Samples are interpolated by cubics with finite-difference slopes; keys are shifted in time and keep their curves.
     A frame is lost if the nearest sample is lost.
-
-    Args:
-        source_fps: frame rate of the motion [1/s].
-        fps: frame rate of the result [1/s].
     """
     ratio = fps / source_fps
     times = motion.frames * ratio

@@ -209,10 +209,7 @@ def subject_given(
     landmarks: Path | None,
     allow_outside: bool,
 ) -> Subject:
-    """Return the subject that the options describe by a capture, both scans, or landmarks.
-
-    Args:
-        name: name of a subject without a capture.
+    """Return the subject that the options describe by a capture, both scans, or landmarks; a capture has its own name.
 
     Raises:
         typer.BadParameter: the options describe no subject, or several.

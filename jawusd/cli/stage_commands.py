@@ -100,7 +100,6 @@ def read_stage_motion(
     """Read a jaw motion from a stage: from the rig in the stage or, if it has none, by fitting the rig's meshes.
 
     Args:
-        loaded, rig: the loaded rig, and its file.
         stage: a stage, or a file that Blender converts to one.
         prim: path of the rig's prim in the stage, or in the rig's file if the stage comes from Blender.
         mandible, skull: paths of the prims above the meshes of mandible and skull.

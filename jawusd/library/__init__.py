@@ -1,4 +1,1 @@
-"""Libraries of rigs: the index of a folder, and jaw motion for a subject without a capture.
-
-This package imports only `base`, `geometry`, `formats` and `evaluator`.
-"""
+"""Libraries of rigs: the index of a folder, and jaw motion for a subject without a capture."""

@@ -139,11 +139,7 @@ def _rig_files(root: Path) -> Iterator[Path]:
 
 
 def _content(path: Path, root: Path) -> str:
-    """Return the SHA-256 of the files from which a rig is read.
-
-    Raises:
-        FormatError: one of the files is not a regular file inside the library, or cannot be read.
-    """
+    """Return the SHA-256 of the files from which a rig is read."""
     total = hashlib.sha256()
     parts = [path]
     if path.name == ACTOR_FILE:  # OpenUSD also opens the files in this folder that the interface layer references

@@ -129,8 +129,7 @@ class PersonalMotion:
 def leave_one_out(donors: Sequence[Donor], *, closest: bool = False) -> Learned:
     """Predict every subject of a library from the other subjects, and choose the bandwidth of the weights.
 
-    Args:
-        closest: Whether to use only the subject with the most similar landmarks instead of an average.
+    With `closest`, only the subject with the most similar landmarks is used, instead of an average.
 
     Raises:
         FittingError: `donors` is empty.
@@ -157,12 +156,7 @@ def leave_one_out(donors: Sequence[Donor], *, closest: bool = False) -> Learned:
 
 
 def personal_motion(donors: Sequence[Donor], target: Array, learned: Learned) -> PersonalMotion:
-    """Predict the motion of a subject from its landmarks and a library.
-
-    Args:
-        target: Landmarks of the subject with the teeth together [mm], shape (5, 3), in the order of `LANDMARKS`.
-        learned: Result of `leave_one_out` for these donors.
-    """
+    """Predict the motion of a subject from its `LANDMARKS` (5, 3) [mm] with the teeth together, and a library."""
     weights = _weights(donors, target, learned.bandwidth_mm)
     used = [(donor, weight) for donor, weight in zip(donors, weights, strict=True) if weight > 0]
     shares = np.concatenate([_captured_shares(donor, _POSES // len(used)) for donor, _ in used])

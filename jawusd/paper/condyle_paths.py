@@ -32,8 +32,7 @@ def condyle_paths(
 ) -> list[CondylePath]:
     """Sweep the first principal component, then the opening d1 of each model up to `widest_mm`.
 
-    Args:
-        mandible: mesh for outlines of the condyle, mandible frame; with None, no outlines are drawn.
+    The mandible (mandible frame) gives the outlines of the condyle; without it, no outlines are drawn.
     """
     sweeps = {PRINCIPAL: principal_opening(data)}
     d = np.zeros((_STEPS, 3))
@@ -46,8 +45,7 @@ def condyle_paths(
 def parameter_paths(data: TrainingData, models: dict[str, JawModelForm], captured: Array) -> tuple[ParameterPath, ...]:
     """Sweep the parameters of each model one at a time, from the closed bite over the captured range.
 
-    Args:
-        captured: parameters of the captured poses in the default model [mm], shape (N, 3).
+    `captured` has the parameters of the captured poses in the default model [mm], shape (N, 3).
     """
     found = []
     # The other parameters stay zero, so d2 and d3 sweep only the range captured with the teeth nearly closed.
@@ -141,11 +139,7 @@ def path_distances(paths: list[CondylePath], captured: Array, d: Array) -> list[
 
 
 def _above(path: Array, captured: Array) -> Array:
-    """Return the heights of path points (K, 3) above the highest captured point with nearly the same z [mm].
-
-    The height is 0 for path points that lie lower. Path points with few captured points (N, 3) near their z are
-    omitted.
-    """
+    """Return how far [mm] path points (K, 3) lie above the highest of the captured points (N, 3) near their z, or 0."""
     beside = np.abs(path[:, None, 2] - captured[None, :, 2]) < _BESIDE_MM
     highest = np.where(beside, captured[None, :, 1], -np.inf).max(1)
     known = beside.sum(1) >= _FEWEST_BESIDE

@@ -54,10 +54,6 @@ class PaperScan:
 def paper_scan(mesh: Mesh, name: str) -> PaperScan:
     """Extract the red and green regions of a painted teeth scan; a face is green if at least two of its corners are.
 
-    Args:
-        mesh: the scan with vertex colours.
-        name: "upper" or "lower", for messages.
-
     Raises:
         TrackingError: the scan has no boundary of interest.
     """
@@ -102,13 +98,9 @@ class PaperEnergy:
         self.evaluations = 0
 
     def show(self, views: Sequence[View], row: int, start: Array, other_row_hides: bool) -> None:
-        """Set the masks of one frame.
+        """Set the masks of one frame, in the views with a mask of arch `row`; the search starts at T_world_scan (4, 4).
 
-        Args:
-            views: views with a mask of this arch.
-            row: 0 upper, 1 lower.
-            start: initial pose of the search, T_world_scan, shape (4, 4).
-            other_row_hides: whether to ignore boundary pixels inside the mask of the other arch.
+        With `other_row_hides`, boundary pixels inside the mask of the other arch are ignored.
         """
         boxes = np.stack([self._box(view, start) for view in views])
         width, height = (boxes[:, 2:] - boxes[:, :2]).max(0)

@@ -62,11 +62,9 @@ class Nlpca:
 
 
 def train_nlpca(data: Array, components: int, seed: int, *, centre: bool = False, stages: int = len(_STAGES)) -> Nlpca:
-    """Train a network with L-BFGS; the result is deterministic for a given seed.
+    """Train a network with k components on data (N, D) with L-BFGS; the result is deterministic for a given seed.
 
     Args:
-        data: training data, shape (N, D).
-        components: number k of bottleneck components.
         centre: whether to subtract the mean of the data first, which the toolbox does not do.
         stages: number of training stages; 4 of 7 reach a cost within a few percent in a tenth of the time.
     """

@@ -1,7 +1,4 @@
-"""The optimiser of the paper (section 4): descent with finite differences, then a dense local search.
-
-This solver exists for comparison; `tracking.contour.solver` is faster and more accurate.
-"""
+"""The optimiser of the paper (section 4): descent with finite differences, then a dense local search."""
 
 from __future__ import annotations
 
@@ -63,16 +60,11 @@ class PaperSolution:
 
 
 def solve_paper(energy: Energy, start: Array, centre: Array, config: PaperConfig) -> PaperSolution:
-    """Minimise the energy of one arch in one frame.
+    """Minimise the energy, E (N,) of poses (N, 4, 4), of one arch in one frame.
 
     The six parameters are those of eq. 6, R = Rz(theta_z) Ry(theta_y) Rx(theta_x) and t, relative to the start: zero is
-    the pose of the previous frame, and rotations are about the centroid of the teeth. The paper does not specify this.
-
-    Args:
-        energy: E of poses (N, 4, 4), shape (N,).
-        start: T_world_scan of the previous frame, shape (4, 4).
-        centre: centre of rotation, scan coordinates [mm], shape (3,).
-        config: settings of the method.
+    T_world_scan (4, 4) of the previous frame, and rotations are about the centroid of the teeth (3,), in scan
+    coordinates [mm]. The paper does not specify this.
     """
 
     def at(parameters: Array) -> Array:
@@ -118,15 +110,9 @@ def _descend(at: Energy, best: Array, lowest: float, rotation: bool, config: Pap
 
 
 def golden_section(line: Line, reach: float, tolerance: float) -> tuple[float, float]:
-    """Find a minimum on [0, reach] by golden-section search (J. Kiefer, Proc. AMS 4, 1953).
+    """Return the best point on [0, reach] and its value, found by golden-section search (J. Kiefer, Proc. AMS 4, 1953).
 
-    Args:
-        line: function that returns its values at a list of points.
-        reach: end of the interval.
-        tolerance: interval length at which the search stops.
-
-    Returns:
-        The better of the last two points, and its value.
+    `line` returns its values at a list of points. The search stops at an interval of the length `tolerance`.
     """
     low, high = 0.0, reach
     a, b = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)

@@ -52,14 +52,11 @@ def track_capture_paper(
     """Track both arches through a capture with the paper's method.
 
     The method neither detects failures nor estimates uncertainty: an arch with at least two masks counts as tracked,
-    however badly it fits. Covariances, sigmas, residuals and matched lengths are NaN, meaning unknown, and models
-    fitted to these tracks weight all frames equally. The only quality measure is `coverage_error`.
+    however badly it fits. Covariances, sigmas, residuals and matched lengths are NaN, meaning unknown. The only quality
+    measure is `coverage_error`.
 
     Args:
-        capture: masks, bootstrap picks and frame range.
-        cameras, offsets: as for `track_capture`.
         upper, lower: teeth scans in one frame [mm], with the boundary of interest painted green.
-        backend: where pixels are rendered and counted.
         threads: number of worker threads of the CPU backend; the result does not depend on this number.
         progress: called after each frame with the number of frames done and the total.
 

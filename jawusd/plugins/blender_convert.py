@@ -41,9 +41,6 @@ def _assign_takes() -> None:
 
     By default, Blender's FBX exporter writes every action for every object, such as the camera's action for the jaw,
     and the importer assigns the first of these actions to the object.
-
-    Raises:
-        ValueError: A mesh moves in several takes, so the choice is ambiguous.
     """
     for found in bpy.data.objects:
         if not any(item.type == "MESH" for item in (found, *found.children_recursive)):

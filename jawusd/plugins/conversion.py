@@ -23,12 +23,9 @@ _TIMEOUT_S = 900
 
 
 def converted(path: str | os.PathLike[str], folder: str | os.PathLike[str], fps: float) -> Path:
-    """Convert a file to a USD stage in a folder; time 0 becomes frame 0.
+    """Convert an .fbx, .glb or .gltf file to a USD stage in a folder; time 0 becomes frame 0.
 
-    Args:
-        path: An .fbx, .glb or .gltf file.
-        folder: Folder of the stage.
-        fps: Frame rate for files that do not contain one, such as glTF files of other programs.
+    `fps` is the frame rate for files that do not contain one, such as glTF files of other programs.
 
     Raises:
         MissingDependencyError: Blender is not installed.

@@ -20,13 +20,9 @@ _VERSION = re.compile(r"^__version__ = .*$", re.MULTILINE)
 
 
 def vendored_files(stubs: Iterable[Path]) -> dict[str, str]:
-    """Return the contents of the files to be added to a package, by path in the package.
+    """Return the modules of a package by path: one for each stub and, below `jawusd/`, those that these modules import.
 
-    Args:
-        stubs: `.pyi` files that import the required names, each in the form `from jawusd.x import y as y`.
-
-    Returns:
-        A module for each stub and, below `jawusd/`, the modules that these modules import.
+    The stubs import the required names, each in the form `from jawusd.x import y as y`.
 
     Raises:
         ValueError: A module imports jawusd in a form other than `from jawusd.x import y`.

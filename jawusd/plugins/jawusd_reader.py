@@ -56,11 +56,7 @@ class ReaderError(Exception):
 
 
 def load(path: str, prim_path: str | None = None) -> Rig:
-    """Load a rig.
-
-    Args:
-        path: `model.npz`, or any USD file with the rig.
-        prim_path: The rig's prim, if the stage has several rigs.
+    """Load a rig from `model.npz` or any USD file; `prim_path` is the rig's prim, if the stage has several rigs.
 
     Raises:
         ReaderError: The file contains no rig, its version is too new, or it is USD and `pxr` is missing.
@@ -167,11 +163,7 @@ def _from_npz(path: str) -> Rig:
 
 
 def _npy(name: str, data: bytes) -> Sequence[float | str]:
-    """Return the values of a .npy file in row-major order (versions 1 to 3 and any memory layout; numpy/lib/format.py).
-
-    Raises:
-        ReaderError: The file is damaged, or contains neither numbers nor a single text.
-    """
+    """Return the values of a .npy file (versions 1 to 3, any memory layout; numpy/lib/format.py) in row-major order."""
     try:
         if data[:6] != b"\x93NUMPY":
             raise ValueError("it has no .npy header")
@@ -203,7 +195,6 @@ class Rig:
     """The jaw of one subject.
 
     Attributes:
-        kind: "anchored" or "additive".
         arrays: The model's arrays by name, each a flat list in row-major order.
         d_range: ((min, max), (min, max), (min, max)) of d1, d2, d3 [mm].
         formula: Evaluator of the model's motion in the anatomical frame.

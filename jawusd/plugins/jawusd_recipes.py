@@ -55,13 +55,9 @@ def every_frame(keys: Keys) -> dict[int, list[float]]:
 
 
 def poses(rig: jawusd_reader.Rig, keys: Keys, *, measured: bool = False) -> dict[int, Rows]:
-    """Return T_skull_mandible [mm] at every key; warn about keys outside the bound.
+    """Return T_skull_mandible [mm] at every key of d1, d2, d3 [mm]; warn about keys outside the bound.
 
-    Args:
-        rig: The rig.
-        keys: d1, d2, d3 [mm] by frame.
-        measured: Whether to keep keys outside the bound, since measured poses may be slightly outside. Otherwise, they
-            are moved to the nearest valid d.
+    These are moved to the nearest valid d, unless `measured`: measured poses may be slightly outside.
     """
     outside = {frame: -rig.margin(*d) for frame, d in keys.items() if not rig.is_inside(*d)}
     if outside:
@@ -80,13 +76,9 @@ def poses(rig: jawusd_reader.Rig, keys: Keys, *, measured: bool = False) -> dict
 def nearest_turn(
     angles: Sequence[float], previous: Sequence[float] | None, middle: int = 1, full: float = 360.0
 ) -> list[float]:
-    """Return the equivalent Euler angles nearest to those of the previous frame.
+    """Return the equivalent Euler angles nearest to those of the previous frame, if there is one.
 
-    Args:
-        angles: Three Euler angles.
-        previous: The previous angles; None at the first frame.
-        middle: Index of the angle that the program applies second.
-        full: A full turn in the unit of the angles.
+    `middle` is the index of the angle that the program applies second, `full` a full turn in the unit of the angles.
     """
     if previous is None:
         return list(angles)

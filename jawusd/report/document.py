@@ -32,9 +32,7 @@ def write_document(
 ) -> BuildVerdict:
     """Write the report to an HTML file; return its summary.
 
-    Args:
-        figures: plots by their slot on the page; default: those of `draw_figures`. The plots of the experiments come
-            from `paper.figures.inline_figures`.
+    `figures` are plots by their slot on the page; default: those of `draw_figures`.
 
     Raises:
         OutputError: the file cannot be written.

@@ -36,12 +36,7 @@ _TIPS_MM = 8.0  # height of the crowns, from the tips of the teeth, on which con
 
 
 def contact_data(clearance: ContactField, teeth: Teeth) -> dict[str, object]:
-    """Return the input of contacts.js, ready for JSON encoding.
-
-    Args:
-        clearance: The clearance of the rig's teeth.
-        teeth: Both arches as solids, in the anatomical frame in occlusion.
-    """
+    """Return the input of contacts.js, ready for JSON encoding; the teeth are in the anatomical frame, in occlusion."""
     closed = clearance.closed_mm
     # If the scans have a gap in the closed bite, that gap counts as contact, as in images of contacts.
     limits = [DEEP.apart_mm - closed, *(mark.apart_mm - min(closed, 0.0) for mark in TOUCHING)]

@@ -1,7 +1,4 @@
-"""Jaw rigs in differentiable solvers: a torch module with poses, bounds and priors on jaw poses.
-
-Imports only `base`, `geometry`, `evaluator` and torch.
-"""
+"""Jaw rigs in differentiable solvers: a torch module with poses, bounds and priors on jaw poses."""
 
 from jawusd.base.errors import MissingDependencyError
 

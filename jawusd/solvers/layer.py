@@ -24,11 +24,7 @@ _CORNERS = [(i, j, k) for i in (0, 1) for j in (0, 1) for k in (0, 1)]
 
 
 class Clearances(nn.Module):
-    """A clearance field over d; all its data are torch buffers.
-
-    Args:
-        field: The clearance field of a rig.
-    """
+    """A clearance field over d; all its data are torch buffers."""
 
     first: Tensor
     step: Tensor
@@ -264,11 +260,7 @@ class JawLayer(nn.Module):
 
 
 def _reject_other_rigs(layer: nn.Module, state: dict[str, Tensor], prefix: str, *_: object) -> None:
-    """Reject the state of another rig before loading.
-
-    Raises:
-        EvaluatorError: the state was saved with another rig, or does not name its rig.
-    """
+    """Raise EvaluatorError before loading a state that was saved with another rig, or that does not name its rig."""
     found, own = state.get(f"{prefix}rig_hash"), layer.get_buffer("rig_hash").tolist()
     if found is None or found.tolist() != own:
         theirs = "is of an unknown rig" if found is None else f"is of rig {bytes(found.tolist()).hex()[:12]}"

@@ -88,12 +88,7 @@ OPERATIONS = TensorOperations()
 
 
 class Formula(nn.Module):
-    """A formula with all its tables and numbers as buffers.
-
-    Args:
-        tables: Rows of floats by name.
-        numbers: Nested tuples of floats or None.
-    """
+    """A formula with all its tables, rows of floats by name, and its nested numbers as buffers."""
 
     singles: Tensor
 

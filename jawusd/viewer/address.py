@@ -95,11 +95,7 @@ class _Handler(socketserver.BaseRequestHandler):
 
 
 def _listen(host: str, port: int) -> _Server:
-    """Return a server on a port, or on the next free one.
-
-    Raises:
-        OutputError: the address cannot be bound, or no port is free.
-    """
+    """Return a server on a port, or on the next free one."""
     family = check_address(host)
     for tried in range(port, min(port + _PORTS, 65536)):
         try:

@@ -33,7 +33,6 @@ class CapturePage:
     """Connect a page's widgets with a capture.
 
     Attributes:
-        footage, picks, labels: the panels.
         layout: layout of the current image; None before the first one.
         poses: T_page_scan (4, 4) of the displayed scans, by arch.
         drawn: number of the redraw request that was drawn last.

@@ -28,11 +28,8 @@ _HELP = (
 class FootagePanel:
     """Widgets that choose camera and frame.
 
-    Attributes:
-        view: name of the camera shown, `SPACE` for the 3-D view, or `ALL` for all cameras side by side.
-        frame: frame of the reference camera.
-        player: plays the footage.
-        worst: frames to inspect, worst first.
+    `view` is the name of the camera shown, `SPACE` for the 3-D view, or `ALL` for all cameras side by side; `worst` are
+    the frames to inspect, worst first.
     """
 
     def __init__(
@@ -185,13 +182,7 @@ class FootagePanel:
 
 
 class PicksPanel:
-    """Widgets for setting the picks.
-
-    Attributes:
-        book: the picks.
-        side: side of the scans that faces the viewer, one of `picking.SIDES`.
-        scans_shown: whether scans are drawn in front of the image.
-    """
+    """Widgets for setting the picks; `side` of the scans faces the viewer, one of `picking.SIDES`."""
 
     def __init__(
         self,

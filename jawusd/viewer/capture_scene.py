@@ -35,9 +35,7 @@ _LIFT_MM = 0.05  # offset of marks in front of the image
 class CaptureScene:
     """3-D scene of a capture in one page.
 
-    Attributes:
-        T_page_world: world to page frame, shape (4, 4); the page frame has the axes of the first camera, so that images
-            are upright.
+    The page frame has the axes of the first camera, so that images are upright; `T_page_world` has shape (4, 4).
     """
 
     def __init__(self, client: viser.ClientHandle, capture: ViewedCapture) -> None:

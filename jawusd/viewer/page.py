@@ -29,11 +29,8 @@ _EMPTY: NDArray[np.uint8] = np.full((3, 4, 3), 255, np.uint8)
 class TakeFootagePanel:
     """Menu of the cameras, and the image of the selected camera; frames outside the take show no image.
 
-    Images are decoded outside the event loop. During playback, frames that would arrive late are left out.
-
-    Attributes:
-        camera: menu of the cameras.
-        drawn: camera and frame of the displayed image; None without one.
+    Images are decoded outside the event loop. During playback, frames that would arrive late are left out. `drawn` is
+    the camera and frame of the displayed image.
     """
 
     def __init__(self, client: viser.ClientHandle, footage: ViewedFootage) -> None:

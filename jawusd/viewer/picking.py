@@ -196,10 +196,8 @@ class PickingLayout:
 def fit_view(points: ArrayLike, away: ArrayLike, up: ArrayLike, aspect: float) -> tuple[Array, Array]:
     """Return the nearest camera position (3,) from which all points (n, 3) are visible, and its target (3,).
 
-    Args:
-        away: direction from target to camera, shape (3,).
-        up: approximate up direction on the screen, shape (3,).
-        aspect: width over height of the screen.
+    `away` (3,) points from the target to the camera, `up` (3,) is the approximate up direction on the screen, and
+    `aspect` its width over its height.
     """
     p = np.asarray(points, dtype=np.float64)
     back = np.asarray(away, dtype=np.float64) / np.linalg.norm(away)

@@ -32,13 +32,10 @@ _TEXT = 'font-family="sans-serif" font-size="11" fill="currentColor"'
 
 @dataclass(frozen=True)
 class Plot:
-    """A plot whose static part has been drawn.
+    """A plot whose static part, the SVG of axes, outlines and points, has been drawn.
 
-    Attributes:
-        name: id of the static part in the page.
-        static: SVG of axes, outlines and points.
-        low, high: corners of the plotted area in data coordinates.
-        across: start and end of the plotted area as fractions of the plot's width.
+    `name` is the id of the static part in the page, `low` and `high` are the corners of the plotted area in data
+    coordinates, and `across` its start and end as fractions of the plot's width.
     """
 
     name: str
@@ -75,8 +72,7 @@ def bound_plot(rig: JawRig, axis: int) -> Plot:
 def posselt_plot(rig: JawRig, axis: int) -> Plot:
     """Plot Posselt's figure: the border movements of the lower incisal point.
 
-    Args:
-        axis: 1 for the frontal plane (x to the left, d3 = 0), 2 for the sagittal plane (x forward, d2 = 0).
+    Axis 1 is the frontal plane (x to the left, d3 = 0), axis 2 the sagittal plane (x forward, d2 = 0).
     """
     origin = rest_places(rig)[INCISOR]
     columns = [0, 1] if axis == 1 else [2, 1]
@@ -130,13 +126,8 @@ def with_playhead(plot: Plot, frame: float) -> str:
 def plot_seek(drawn: str, ends: tuple[float, float], across: tuple[float, float], slider: str) -> str:
     """Return the HTML of a plot in which a click or drag sets a frame slider to the frame under the pointer.
 
-    viser does not report clicks in a plot, so the page emulates keyboard input to the slider.
-
-    Args:
-        drawn: SVG of the plot, one element.
-        ends: first and last frame of the plot's axis.
-        across: positions of the two frames as fractions of the plot's width.
-        slider: id of the slider in the page.
+    viser does not report clicks in a plot, so the page emulates keyboard input to the slider with the given id. `ends`
+    are the first and last frame of the axis, `across` their positions as fractions of the plot's width.
     """
     low, high = across
     share = f"((event.clientX-r.left)/r.width-{low:.5f})/{high - low:.5f}"

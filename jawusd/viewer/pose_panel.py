@@ -153,10 +153,8 @@ class PosePanel:
 def slider_ends(limits: Array, d_range: Array, keep_valid: bool) -> list[tuple[float, float]]:
     """Return the lower and the upper end of each of the three sliders [mm].
 
-    Args:
-        limits: valid range at the current pose, shape (3, 2) [mm].
-        d_range: overall range of the rig, shape (3, 2) [mm].
-        keep_valid: use `limits`, rounded inwards to the slider step, instead of the widened `d_range`.
+    They are the valid limits (3, 2) [mm] at the current pose, rounded inwards to the slider step, or without
+    `keep_valid` the overall range (3, 2) [mm] of the rig, widened.
     """
     if keep_valid:
         return [(_outwards(low, 1), _outwards(high, -1)) for low, high in limits]

@@ -26,9 +26,7 @@ _RADIUS_MM = (0.3, 8.0, 0.1, 1.5)  # radius of the brush: minimum, maximum, step
 class ScanBrush:
     """Editable labels of both scans in one page, with undo.
 
-    Attributes:
-        labels: label of every vertex as in `formats.mesh`, uint8 (V,), by arch.
-        changed: arches with unsaved labels.
+    `labels` has the label of every vertex as in `formats.mesh`, uint8 (V,), by arch; `changed` names unsaved arches.
     """
 
     def __init__(self, scans: Mapping[str, Mesh], labels: Mapping[str, NDArray[np.uint8]]) -> None:
@@ -94,12 +92,7 @@ def surface_near(mesh: Mesh, vertex: int, radius_mm: float) -> Indices:
 
 
 class ScanLabelsPanel:
-    """Widgets that control the brush.
-
-    Attributes:
-        brush: the labels.
-        label: the label that a click paints.
-    """
+    """Widgets that control the brush; a click paints `label`."""
 
     def __init__(
         self,

@@ -225,9 +225,7 @@ class JawScene:
 def preset_view(rest: Array, preset: str, aspect: float = 1.0) -> tuple[Array, Array]:
     """Return the target (3,) and the camera position (3,) of a preset view [mm].
 
-    Args:
-        rest: landmarks at rest, shape (5, 3) [mm].
-        aspect: width over height of the screen.
+    `rest` are the landmarks at rest, shape (5, 3) [mm]; `aspect` is width over height of the screen.
     """
     target = rest[list(CONDYLES) + [INCISOR]].mean(axis=0)
     if preset.startswith("condyle"):

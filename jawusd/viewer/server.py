@@ -82,10 +82,9 @@ class PageServer(ABC):
     """Server with one page per visitor; `pages` are the open pages by client number; `url` is the address to open."""
 
     def __init__(self, name: str, host: str, port: int, first: FirstPage | None = None) -> None:
-        """Start serving on a port: 0 selects any free port; instead of a port in use, the next free one is taken.
+        """Start serving on a port, or on that of `first`, which has served the page so far.
 
-        Args:
-            first: has served the page on the address so far; its port is taken instead of `port`.
+        Port 0 selects any free port; instead of a port in use, the next free one is taken.
 
         Raises:
             OutputError: the address does not belong to this machine.
@@ -155,11 +154,9 @@ class Viewer(PageServer):
         play: bool = True,
         first: FirstPage | None = None,
     ) -> None:
-        """Start serving an actor; see `PageServer`. Further errors are those of `load`, after which nothing is served.
+        """Start serving an actor; see `PageServer`. With `play`, a new page plays the captured take.
 
-        Args:
-            load: returns the actor; called once the server accepts visitors, who wait for it.
-            play: whether a new page plays the captured take.
+        `load` is called once the server accepts visitors, who wait for it; after an error of it, nothing is served.
         """
         self._play = play
         self._shown_s = -math.inf
@@ -206,12 +203,9 @@ def wait_until_drawn(client: viser.ClientHandle) -> None:
 
 
 def is_own_page(host: str, origin: str | None, local: bool) -> bool:
-    """Return whether a connection comes from a page of this server.
+    """Return whether a connection comes from a page of this server, by its Host header and its Origin header, if any.
 
-    Args:
-        host: the Host header, name and port.
-        origin: the Origin header; only browsers send one.
-        local: whether the server listens on a loopback address; any other name in `host` then indicates DNS rebinding.
+    If the server listens on a loopback address (`local`), any other name in `host` indicates DNS rebinding.
     """
     name = urlsplit(f"//{host}").hostname or ""
     if local and not is_loopback(name):

@@ -1,7 +1,5 @@
 """Blender add-on for jaw rigs imported from USD: sliders, keys, handles, cameras, and export back to USD.
 
-An import also sets frame rate, frame range and units of the scene, and shows the footage of cameras.
-
 `python -m jawusd.plugins FILE.zip` builds the extension, which includes the modules of jawusd that it needs.
 """
 

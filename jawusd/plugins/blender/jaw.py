@@ -90,8 +90,7 @@ def actors() -> list[bpy.types.Object]:
 def mandible_of(actor: bpy.types.Object) -> bpy.types.Object:
     """Return the mandible of an actor.
 
-    Children of the actor are searched first: in reopened files, the mandibles of library overrides refer to the actor
-        in the library.
+    Children are searched first: in reopened files, mandibles of library overrides refer to the actor in the library.
 
     Raises:
         vendored.JawusdError: The mandible was deleted.

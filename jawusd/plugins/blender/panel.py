@@ -1,8 +1,4 @@
-"""Panels, and the operators of their buttons: key, add handle, export, bake.
-
-The panels show the sliders of the rigs in the scene, the validity of the poses, and a warning if an export would lose
-motion.
-"""
+"""Panels, and the operators of their buttons: key, add handle, export, bake."""
 
 from __future__ import annotations
 
