@@ -155,16 +155,12 @@ _ELSE = "no incomplete file was written"
 
 
 class _Parameter(Protocol):
-    """A typer argument or option."""
-
     param_type_name: str
 
     def get_help_record(self, ctx: typer.Context) -> tuple[str, str] | None: ...
 
 
 class _Formatter(Protocol):
-    """The formatter of typer's help text."""
-
     def section(self, name: str) -> AbstractContextManager[None]: ...
     def write(self, text: str) -> None: ...
     def write_dl(self, rows: Sequence[tuple[str, str]]) -> None: ...

@@ -40,7 +40,6 @@ class AuthoredMotion:
     keys: Keys | None = None  # keys between which the motion was interpolated
 
     def __post_init__(self) -> None:
-        """Validate frames and parameters."""
         if not len(self.frames):
             raise FormatError("the motion has no frames.")
         falls = np.flatnonzero(np.diff(self.frames) <= 0)

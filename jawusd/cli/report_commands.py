@@ -113,7 +113,6 @@ def _emit_experiments(found: Experiments, files: list[Path], as_json: bool) -> N
 def _report_found(
     source: Path, capture: Path | None, out: Path | None, force: bool, allow_outside: bool, as_json: bool
 ) -> None:
-    """Write the report of a solve or a build."""
     from jawusd.base.guard import map_large_arrays
     from jawusd.pipeline.report import report_build
     from jawusd.pipeline.solve_report import check_page, report_solve
@@ -197,7 +196,6 @@ def _is_capture(rig: Path | None) -> bool:
 
 
 def _name_changed_files(*folders: Path) -> None:
-    """Print which files have changed since the builds."""
     for folder in folders:
         from jawusd.pipeline.state import changed_files
 
@@ -208,7 +206,6 @@ def _name_changed_files(*folders: Path) -> None:
 def _serve_capture(
     capture: Path, tracks: Path | None, host: str, port: int, browser: bool, allow_outside: bool
 ) -> None:
-    """Serve the page of a capture."""
     from jawusd.pipeline.view_capture import open_capture_viewer
 
     with progress() as report:
@@ -264,7 +261,6 @@ def _announce(browser: bool, url: str) -> None:
 
 
 def _write_page(rig: Path | None, page: Path, force: bool, prim: str | None, footage: bool) -> None:
-    """Write the web page of a rig that needs no server."""
     from jawusd.pipeline.pose_page import write_page
 
     if _is_capture(rig):

@@ -60,7 +60,6 @@ def _findings(summary: BuildSummary) -> tuple[list[str], list[str]]:
 
 
 def _key_lines(summary: BuildSummary) -> list[str]:
-    """Return the key results of a build as a few lines."""
     track, fit = summary["track"], summary["fit"]
     sigma_mm = {name: value for name, value in track["sigma_mm"].items() if value is not None}
     lines = ["the capture names no calibration: one was made from its boards"] if summary["calibrate"] else []
@@ -85,7 +84,6 @@ def _key_lines(summary: BuildSummary) -> list[str]:
 
 
 def _stage_lines(summary: BuildSummary) -> list[str]:
-    """Return all results of a build."""
     lines = _findings(summary)[0]
     if summary["calibrate"]:
         lines += [

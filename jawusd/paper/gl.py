@@ -133,7 +133,6 @@ class GlCounter:
     """
 
     def __init__(self, context: moderngl.Context, scan: PaperScan) -> None:
-        """Upload the scan to a context opened by `open_context`."""
         self._gl = context
         self._flags = moderngl.CULL_FACE if scan.cull else moderngl.NOTHING
         self._program = context.program(vertex_shader=_VERTEX, fragment_shader=_FRAGMENT)

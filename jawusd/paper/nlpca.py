@@ -132,7 +132,6 @@ def _cost(
 
 
 def _split(flat: Values, shapes: list[tuple[int, ...]]) -> list[Values]:
-    """Split a flat vector of parameters into layers."""
     parts, start = [], 0
     for shape in shapes:
         size = int(np.prod(shape))

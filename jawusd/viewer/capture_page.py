@@ -39,7 +39,6 @@ class CapturePage:
     """
 
     def __init__(self, client: viser.ClientHandle, capture: ViewedCapture) -> None:
-        """Build the page."""
         self.client, self._capture = client, capture
         gui = client.gui
         begin_panel(client, capture.name)
@@ -140,7 +139,6 @@ class CapturePage:
         return show
 
     def _look(self) -> None:
-        """Move the virtual camera so that everything is in view."""
         camera = self.client.camera
         aspect = camera.image_width / camera.image_height
         seen = [
@@ -228,7 +226,7 @@ class CapturePage:
         facing = make_transform(T_world_cam[:3, :3] @ np.diag([1.0, -1.0, -1.0]), met)
         return facing @ self._capture.T_anatomical_skull
 
-    async def _clicked(self, event: viser.SceneClickEvent) -> None:
+    def _clicked(self, event: viser.SceneClickEvent) -> None:
         """Pick the vertex or pixel under the pointer, or paint the scan there."""
         if not self.picks.picking.value and not self.labels.painting.value:
             return
@@ -258,7 +256,6 @@ class CapturePage:
         self.turn()
 
     def _show_labels(self, arch: str) -> None:
-        """Redraw a scan after its labels have changed."""
         brush = self.labels.brush
         self.scene.show_labels(arch, *(brush.faces_with(arch, label) for label in BRUSHES.values()))
 
@@ -273,7 +270,6 @@ class CaptureViewer(PageServer):
     """Server of a capture."""
 
     def __init__(self, capture: ViewedCapture, host: str, port: int) -> None:
-        """Start serving a capture; see `PageServer`."""
         self._capture = capture
         super().__init__(capture.name, host, port)
         set_first_view(self._server)

@@ -56,19 +56,19 @@ class FootagePanel:
         self.views = gui.add_button_group("view", views)
         self.views.on_click(guarded(client, self._choose))
         self._look = gui.add_dropdown("draw", tuple(_LOOKS))
-        self._look.on_update(guarded(client, self._redraw))
+        self._look.on_update(guarded(client, lambda _: changed()))
         if capture.tracks is not None:
             self._plot = self._draw_plot(capture.tracks)
             gui.add_html(self._plot.definition())
         self._playhead = gui.add_html("")
         first, last = capture.frames
         self.slider = gui.add_slider("frame", first, max(last, first + 1), 1, self.frame)  # ends must differ
-        self.slider.on_update(guarded(client, self._slide))
+        self.slider.on_update(guarded(client, lambda _: self.go_to(self.slider.value)))
         self.play = gui.add_button("play", icon=viser.Icon.PLAYER_PLAY)
         self.play.on_click(guarded(client, self._toggle))
         self.loop = gui.add_checkbox("loop", True)
         self.steps = gui.add_button_group("step", tuple(_STEPS))
-        self.steps.on_click(guarded(client, self._step))
+        self.steps.on_click(guarded(client, lambda event: self.go_to(self.frame + _STEPS[event.target.value])))
         if self.worst:
             self.jumps = gui.add_button_group("worst", ("first", "next worse", "previous"))
             self.jumps.on_click(guarded(client, self._jump))
@@ -137,15 +137,12 @@ class FootagePanel:
             lines.append(f"number {self.worst.index(frame) + 1} of {len(self.worst)} frames to inspect")
         self._words.content = small_text("<br>".join(lines), "padding-bottom:6px")
 
-    async def _choose(self, event: Choice) -> None:
+    def _choose(self, event: Choice) -> None:
         self.view = event.target.value
         self.refresh()
         self._turned()
 
-    async def _redraw(self, _: object) -> None:
-        self._changed()
-
-    async def _toggle(self, _: object) -> None:
+    def _toggle(self, _: object) -> None:
         if self.player.playing:
             self.player.stop()
             return
@@ -166,13 +163,7 @@ class FootagePanel:
         self.refresh()
         self._changed()
 
-    async def _slide(self, _: object) -> None:
-        self.go_to(self.slider.value)
-
-    async def _step(self, event: Choice) -> None:
-        self.go_to(self.frame + _STEPS[event.target.value])
-
-    async def _jump(self, event: Choice) -> None:
+    def _jump(self, event: Choice) -> None:
         here = self.worst.index(self.frame) if self.frame in self.worst else None
         if event.target.value == "first" or here is None:
             target = 0
@@ -201,7 +192,7 @@ class PicksPanel:
         gui = client.gui
         gui.add_html(small_text(_HELP))
         self.picking = gui.add_checkbox("clicks set picks", capture.tracks is None, hint=_PICKING_HINT)
-        self.picking.on_update(guarded(client, self._turn))
+        self.picking.on_update(guarded(client, lambda _: turned()))
         self.sides = gui.add_button_group("scans", tuple(SIDES))
         self.sides.on_click(guarded(client, self._choose_side))
         self.chosen = gui.add_dropdown("pick", (_NONE,))
@@ -243,19 +234,16 @@ class PicksPanel:
             lines.append(self._fit)
         self._list.content = small_text("<br>".join(lines))
 
-    async def _turn(self, _: object) -> None:
-        self._turned()
-
-    async def _choose_side(self, event: Choice) -> None:
+    def _choose_side(self, event: Choice) -> None:
         self.side = event.target.value
         self._turned()
 
-    async def _choose(self, _: object) -> None:
+    def _choose(self, _: object) -> None:
         number = self.chosen.options.index(self.chosen.value) - 1
         self.book.selected = None if number < 0 else number
         self._changed()
 
-    async def _remove(self, event: Choice) -> None:
+    def _remove(self, event: Choice) -> None:
         if event.target.value == "pixel":
             self.book.remove_pixel(self._footage.view)
         elif event.target.value == "pick":
@@ -264,7 +252,7 @@ class PicksPanel:
             self.book.clear()
         self._changed()
 
-    async def _go(self, _: object) -> None:
+    def _go(self, _: object) -> None:
         if self.book.frame is None:
             raise ValueError("no pick has a pixel yet, so there is no frame to show")
         self._footage.go_to(self.book.frame)

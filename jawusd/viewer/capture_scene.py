@@ -39,7 +39,6 @@ class CaptureScene:
     """
 
     def __init__(self, client: viser.ClientHandle, capture: ViewedCapture) -> None:
-        """Draw everything that does not depend on the image."""
         self._client, self._scene, self._capture = client, client.scene, capture
         scene = self._scene
         self.T_page_world = next((camera.T_cam_world for camera in capture.cameras.values()), np.eye(4))

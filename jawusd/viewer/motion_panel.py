@@ -30,7 +30,6 @@ class Playback:
     """A line with the name and current frame of the motion, and a button that plays and pauses it."""
 
     def __init__(self, client: viser.ClientHandle) -> None:
-        """Add the line and the button to the current container."""
         self._line = client.gui.add_html("")
         self.button = client.gui.add_button("play", icon=viser.Icon.PLAYER_PLAY)
 
@@ -192,7 +191,7 @@ class MotionPanel:
         else:
             self.show(clip.span[0])
 
-    async def _scrub(self, _: object) -> None:
+    def _scrub(self, _: object) -> None:
         self.player.stop()
         self.show(float(self.frame_slider.value))
 
@@ -213,7 +212,7 @@ class MotionPanel:
         fps = self._session.work.fps if self.source.value == KEYS else clip.fps
         self.player.start(self.frame, fps, clip.span, lambda: bool(self.loop.value))
 
-    async def _edit(self, event: Choice) -> None:
+    def _edit(self, event: Choice) -> None:
         session, frame = self._session, float(round(self.frame))
         self.player.stop()
         if event.target.value == "set":
@@ -231,7 +230,7 @@ class MotionPanel:
         self.frame = frame
         self._changed()
 
-    async def _jump(self, event: Choice) -> None:
+    def _jump(self, event: Choice) -> None:
         self.player.stop()
         frames = [key.frame for key in self._session.work.keys]
         if event.target.value == "next":
@@ -241,15 +240,15 @@ class MotionPanel:
         if reached is not None:
             self.show(reached)
 
-    async def _drag_keys(self, _: object) -> None:
+    def _drag_keys(self, _: object) -> None:
         self._session.move_keys(self.thumbs.value, self.frame)
         self._changed()
 
-    async def _interpolate(self, _: object) -> None:
+    def _interpolate(self, _: object) -> None:
         self._session.set_interpolation(self.between.value)
         self.show(self.frame)
 
-    async def _rate(self, _: object) -> None:
+    def _rate(self, _: object) -> None:
         self._session.set_fps(float(self.fps.value))
         self._changed()
 
@@ -279,14 +278,14 @@ class FilePanel:
         gui.add_button("save CSV of d").on_click(guarded(client, self._save_csv))
         limit_uploads(client, self.load)
 
-    async def _save(self, _: object) -> None:
+    def _save(self, _: object) -> None:
         saved = self._session.saved_keys()
         if saved is None:
             raise FormatError("there are no keys to save.", hint='Press "set" under "keys".')
         content = _written(lambda path: save_keys(path, saved), "keys.json")
         self._client.send_file_download("keys.json", content, save_immediately=True)
 
-    async def _load(self, _: object) -> None:
+    def _load(self, _: object) -> None:
         upload = self.load.value
         name, suffix = upload_name(upload, (".json", ".csv"))
         with tempfile.TemporaryDirectory() as folder:
@@ -311,7 +310,7 @@ class FilePanel:
         warning = f" {outside} of its {len(clip.d)} samples lie outside the bound." if outside else ""
         notify(self._client, "Written", f"{path}.{warning}")
 
-    async def _save_csv(self, _: object) -> None:
+    def _save_csv(self, _: object) -> None:
         clip = self._to_export()
         first, last = clip.span
         frames = np.arange(np.ceil(first), np.floor(last) + 1)

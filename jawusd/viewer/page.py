@@ -43,15 +43,12 @@ class TakeFootagePanel:
         phone = client.camera.image_width < PHONE * client.camera.image_height
         choices = (OFF, *footage.cameras)
         self.camera = client.gui.add_dropdown("footage", choices, initial_value=choices[0 if phone else 1])
-        self.camera.on_update(guarded(client, self._choose))
+        self.camera.on_update(guarded(client, lambda _: self._start(self._frame)))
         self._image = client.gui.add_image(_EMPTY, format="jpeg", visible=False)
 
     def show(self, frame: float) -> None:
         """Show the image of the nearest whole frame as soon as it is decoded; any thread may call this."""
         self._loop.call_soon_threadsafe(self._start, round(frame))
-
-    async def _choose(self, _: object) -> None:
-        self._start(self._frame)
 
     def _start(self, frame: int) -> None:
         self._frame = frame
@@ -104,7 +101,6 @@ class StaticPlots:
     """Static parts of a rig's plots, drawn once for all pages."""
 
     def __init__(self, rig: JawRig) -> None:
-        """Draw the four plots of a rig."""
         self.rest = rest_places(rig)
         self.bounds = {axis: bound_plot(rig, axis) for axis in (1, 2)}
         self.posselt = {axis: posselt_plot(rig, axis) for axis in (2, 1)}
@@ -114,7 +110,6 @@ class PlotPanel:
     """The plots of one page, with the current pose marked: bounds and Posselt's figures."""
 
     def __init__(self, client: viser.ClientHandle, rig: JawRig, static: StaticPlots) -> None:
-        """Add the panel, docked on the left."""
         self._rig, self._static = rig, static
         panel = client.gui.add_panel()
         with panel.add_tab("Bounds and borders"):
@@ -192,7 +187,7 @@ class Page:
         self.motion.player.stop()
         self.refresh()
 
-    async def _drag(self, event: viser.SceneNodeDragEvent[viser.MeshHandle]) -> None:
+    def _drag(self, event: viser.SceneNodeDragEvent[viser.MeshHandle]) -> None:
         session, scene = self.session, self.scene
         if event.phase == "start":
             self.motion.player.stop()

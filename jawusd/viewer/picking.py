@@ -50,7 +50,6 @@ class PickBook:
     """
 
     def __init__(self, given: Bootstrap | None = None) -> None:
-        """Start with the picks of a capture."""
         self.picks: list[PickDraft] = []
         self.frame: int | None = None
         self.selected: int | None = None

@@ -19,7 +19,7 @@ from jawusd.viewer.plots import GREEN, VERMILION
 from jawusd.viewer.readouts import Readout, nearest_captured
 from jawusd.viewer.scene import PRESETS, JawScene
 from jawusd.viewer.session import Session
-from jawusd.viewer.widgets import Choice, add_dark_checkbox, assign, guarded, small_text
+from jawusd.viewer.widgets import add_dark_checkbox, assign, guarded, small_text
 
 STEP_MM = 0.01
 NAMES = ("opening", "laterotrusion", "protrusion")
@@ -63,23 +63,28 @@ class PosePanel:
         self.keep_valid.on_update(guarded(client, self._keep))
         gui.add_html(_DRAG_HELP)
         self.reading = gui.add_html("")
-        gui.add_button_group("history", ("undo", "redo", "close jaw")).on_click(guarded(client, self._step))
+        history = gui.add_button_group("history", ("undo", "redo", "close jaw"))
+        history.on_click(guarded(client, lambda event: self._step(event.target.value)))
         gui.add_html(_KEYS_HELP)
         with gui.add_folder("Pin while dragging"):
             self.pins = {name: self._add_pin(name) for name in _PINNABLE}
         with gui.add_folder("View"):
-            gui.add_button_group("look from", tuple(PRESETS)).on_click(guarded(client, self._look))
-            gui.add_checkbox("paths and captured positions", True).on_update(guarded(client, self._show_paths))
+            views = gui.add_button_group("look from", tuple(PRESETS))
+            views.on_click(guarded(client, lambda event: scene.look(event.target.value)))
+            paths = gui.add_checkbox("paths and captured positions", True)
+            paths.on_update(guarded(client, lambda _: scene.show_paths(paths.value)))
             self.ghosts = gui.add_checkbox("nearest captured poses", False, hint=_GHOSTS_HELP)
-            self.ghosts.on_update(guarded(client, self._show_ghosts))
+            self.ghosts.on_update(guarded(client, lambda _: self._draw_ghosts()))
             add_dark_checkbox(client)
-        gui.add_command("Undo", hotkey="Z", modifier="cmd/ctrl").on_trigger(guarded(client, self._undo))
-        gui.add_command("Redo", hotkey="Z", modifier="cmd/ctrl+shift").on_trigger(guarded(client, self._redo))
+        undo = gui.add_command("Undo", hotkey="Z", modifier="cmd/ctrl")
+        undo.on_trigger(guarded(client, lambda _: self._step("undo")))
+        redo = gui.add_command("Redo", hotkey="Z", modifier="cmd/ctrl+shift")
+        redo.on_trigger(guarded(client, lambda _: self._step("redo")))
 
     def _add_slider(self, index: int, label: str) -> viser.GuiSliderHandle[float]:
         slider = self._client.gui.add_slider(label, -1.0, 1.0, STEP_MM, 0.0, hint=_HINTS[index])
 
-        async def moved(_: object) -> None:
+        def moved(_: object) -> None:
             self._session.set_parameter(index, float(slider.value))
             self._changed()
 
@@ -89,48 +94,31 @@ class PosePanel:
     def _add_pin(self, name: str) -> viser.GuiCheckboxHandle:
         box = self._client.gui.add_checkbox(name.replace("_", " "), False)
 
-        async def pinned(_: object) -> None:
+        def pinned(_: object) -> None:
             self._session.set_pin(name, bool(box.value))
             self._changed()
 
         box.on_update(guarded(self._client, pinned))
         return box
 
-    async def _keep(self, _: object) -> None:
+    def _keep(self, _: object) -> None:
         self._session.set_keep_valid(self.keep_valid.value)
         self._changed()
 
-    async def _step(self, event: Choice) -> None:
-        if event.target.value == "undo":
+    def _step(self, where: str) -> None:
+        if where == "undo":
             self._session.undo()
-        elif event.target.value == "redo":
+        elif where == "redo":
             self._session.redo()
         else:
             self._session.set_pose([0.0, 0.0, 0.0])
         self._changed()
-
-    async def _undo(self, _: object) -> None:
-        self._session.undo()
-        self._changed()
-
-    async def _redo(self, _: object) -> None:
-        self._session.redo()
-        self._changed()
-
-    async def _look(self, event: Choice) -> None:
-        self._scene.look(event.target.value)
-
-    async def _show_ghosts(self, _: object) -> None:
-        self._draw_ghosts()
 
     def _draw_ghosts(self) -> None:
         """Draw the captured poses nearest to the current one if they are switched on."""
         rig, d = self._session.rig, self._session.d
         near = nearest_captured(rig, d) if self.ghosts.value else np.zeros((0, 3))
         self._scene.show_ghosts(rig.pose(near))
-
-    async def _show_paths(self, event: viser.GuiEvent[viser.GuiCheckboxHandle]) -> None:
-        self._scene.show_paths(event.target.value)
 
     def refresh(self, readout: Readout) -> None:
         """Update sliders, pins and read-outs from the session."""
@@ -228,7 +216,7 @@ class ContactPanel:
         self.picture = gui.add_image(_NOTHING, format="png", visible=False)
         self.text = gui.add_html("", visible=False)
 
-    async def _switch(self, _: object) -> None:
+    def _switch(self, _: object) -> None:
         self.picture.visible = self.text.visible = self.shown.value
         self._changed()
 

@@ -135,15 +135,15 @@ class ScanLabelsPanel:
         state = f"painting {name}; {self.brush.strokes} strokes; "
         self._state.content = small_text(state + (f"not saved: {unsaved}" if unsaved else "all saved"))
 
-    async def _turn(self, _: object) -> None:
+    def _turn(self, _: object) -> None:
         self._show_state()
         self._turned()
 
-    async def _choose(self, event: Choice) -> None:
+    def _choose(self, event: Choice) -> None:
         self.label = BRUSHES[event.target.value]
         self._show_state()
 
-    async def _undo(self, _: object) -> None:
+    def _undo(self, _: object) -> None:
         arch = self.brush.undo()
         if arch is not None:
             self._painted(arch)

@@ -90,7 +90,6 @@ class JawScene:
     """3-D scene of one page: first only skull and jaw, then `add_marks`; `grips` are the meshes that can be dragged."""
 
     def __init__(self, client: viser.ClientHandle, actor: ViewedActor) -> None:
-        """Draw skull and jaw in occlusion."""
         self._client, self._scene = client, client.scene
         self._T_world_skull = np.array(actor.rig.T_anatomical_skull)
         self._rest = rest_places(actor.rig)

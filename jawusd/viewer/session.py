@@ -52,7 +52,6 @@ class Session:
     """Posing, dragging and keying of a rig by one visitor; with `keep_valid`, sliders stay inside the bound."""
 
     def __init__(self, rig: JawRig, fps: float) -> None:
-        """Start in occlusion and without keys."""
         self.rig = rig
         self.work = Work(d=triple(rig.project(np.zeros(3))), fps=fps)
         self.keep_valid = True

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import functools
 import html
 import json
 import logging
@@ -52,10 +51,7 @@ def add_dark_checkbox(client: viser.ClientHandle) -> None:
     """Add the checkbox for dark mode, which is checked by default."""
     box = client.gui.add_checkbox("dark page", True)
 
-    async def darken(_: object) -> None:
-        set_theme(client.gui, box.value)
-
-    box.on_update(guarded(client, darken))
+    box.on_update(guarded(client, lambda _: set_theme(client.gui, box.value)))
 
 
 def assign(widget: viser.GuiInputHandle[Value], value: Value) -> None:
@@ -101,18 +97,19 @@ def errors_shown(client: viser.ClientHandle) -> Iterator[None]:
 
 
 def guarded(
-    client: viser.ClientHandle, action: Callable[[Event], Coroutine[object, None, None]]
+    client: viser.ClientHandle, action: Callable[[Event], Coroutine[object, None, None] | None]
 ) -> Callable[[Event], Coroutine[object, None, None]]:
-    """Wrap a callback for a visitor's events so that errors are shown in the page.
+    """Make a callback in the event loop of a function or coroutine for a visitor's events; show its errors in the page.
 
     Events without a client come from the program itself, which has set a widget, and are ignored.
     """
 
-    @functools.wraps(action)
     async def callback(event: Event) -> None:
         if getattr(event, "client", None) is not None:
             with errors_shown(client):
-                await action(event)
+                running = action(event)
+                if running is not None:
+                    await running
 
     return callback
 
