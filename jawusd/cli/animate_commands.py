@@ -3,18 +3,31 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
+import numpy as np
 import typer
 
+import jawusd
+from jawusd.base.errors import FormatError
+from jawusd.cli.motion import (
+    AuthoredMotion,
+    Changes,
+    carried_over,
+    emit_motion,
+    follow_curves,
+    kept_inside,
+    knots_of,
+    read_motion,
+    resampled,
+)
 from jawusd.cli.options import USD_SUFFIXES, Allow, Force, Json, Prim, RigArg, rig_of_folder
 from jawusd.cli.output import emit, refuse_any
+from jawusd.cli.stage_commands import holds_stage, moved_mm, read_stage_motion, still_lines
+from jawusd.evaluator import JawRig
+from jawusd.formats.arkit import read_arkit, shares_of
 from jawusd.formats.atomic import refuse_existing
-
-if TYPE_CHECKING:
-    from jawusd.cli.motion import AuthoredMotion, Changes
-    from jawusd.evaluator import JawRig
-
+from jawusd.formats.poses import save_joint_table
 
 Rate = Annotated[
     float | None,
@@ -33,9 +46,6 @@ RetargetFrom = Annotated[
 
 
 def _source_motion(loaded: JawRig, rig: Path, source: Path, prim: str | None) -> AuthoredMotion:
-    from jawusd.cli.motion import AuthoredMotion, read_motion
-    from jawusd.cli.stage_commands import holds_stage, read_stage_motion
-
     if not holds_stage(source):
         return read_motion(loaded, source)
     own = None if source.suffix.lower() in USD_SUFFIXES else prim  # the rig's prim path in the stage may differ
@@ -45,9 +55,6 @@ def _source_motion(loaded: JawRig, rig: Path, source: Path, prim: str | None) ->
 
 def _kept(loaded: JawRig, source: Path | None, motion: AuthoredMotion) -> tuple[AuthoredMotion, Changes]:
     """Return the motion moved inside the bound, and the changes; warn if a stage, FBX or glTF has no motion."""
-    from jawusd.cli.motion import kept_inside
-    from jawusd.cli.stage_commands import holds_stage, moved_mm, still_lines
-
     kept, changes = kept_inside(loaded, motion)
     if source is not None and holds_stage(source):
         changes.lines.extend(still_lines(moved_mm(loaded, motion.d), len(motion.d)))
@@ -86,7 +93,6 @@ def _write(
     out: Path, rig: Path, loaded: JawRig, motion: AuthoredMotion, rate: float, prim: str | None, splines: Path | None
 ) -> tuple[AuthoredMotion, list[str]]:
     """Write a layer or a .glb, and optionally the keys as splines; return the motion written, and notes."""
-    from jawusd.cli.motion import follow_curves, knots_of
     from jawusd.rig import write_animation, write_splines
     from jawusd.rig.glb import frame_at_zero, write_glb
     from jawusd.rig.rebake import write_over
@@ -136,8 +142,6 @@ def animate(
     as_json: Json = False,
 ) -> None:
     """Write an animation layer over a rig, or meshes and motion as .glb; frames clamped to the bound are reported."""
-    import jawusd
-    from jawusd.cli.motion import carried_over, emit_motion, resampled
     from jawusd.rig import describe
 
     _refuse_conflicts(source, arkit, retarget_from, mapping, resample, prim, splines, out)
@@ -178,8 +182,6 @@ def arkit_table(
     Offsets are in millimetres and degrees relative to the neutral face, about the point midway between the condyles,
     along the skull's axes.
     """
-    import jawusd
-    from jawusd.formats.poses import save_joint_table
     from jawusd.pipeline.bake import joint_deltas
     from jawusd.pipeline.skin import load_own_skin
 
@@ -217,11 +219,6 @@ def read_face(rig: JawRig, source: Path, fps: float | None, mapping: Path | None
     Raises:
         FormatError: the file is invalid or has no row with a face, or the mapping belongs to another subject.
     """
-    import numpy as np
-
-    from jawusd.base.errors import FormatError
-    from jawusd.cli.motion import AuthoredMotion
-    from jawusd.formats.arkit import read_arkit, shares_of
     from jawusd.pipeline.skin import load_own_skin, own_columns, read_blend_face
 
     if mapping is not None:

@@ -2,27 +2,31 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NamedTuple
 
+import numpy as np
 import typer
+from numpy.typing import NDArray
 
-from jawusd.cli.options import Allow, Force, Json, Prim, RigArg, UnitOption
+import jawusd
+from jawusd.base.arrays import Array
+from jawusd.base.errors import naming_file
+from jawusd.cli.animate_commands import rate_of
+from jawusd.cli.animate_commands import read_face as read_arkit_motion
+from jawusd.cli.options import Allow, Force, Json, Prim, RigArg, UnitOption, rigid_bodies
 from jawusd.cli.output import emit, refuse_any
+from jawusd.evaluator import JawRig
+from jawusd.evaluator.skin import Skin
+from jawusd.evaluator.verdicts import INSIDE, Verdicts
+from jawusd.formats.alignment import Alignment, load_alignment, load_correspondences, save_alignment
 from jawusd.formats.atomic import refuse_existing
+from jawusd.formats.face_table import FaceTable, header_of
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
-    from jawusd.base.arrays import Array
-    from jawusd.evaluator import JawRig
-    from jawusd.evaluator.skin import Skin
-    from jawusd.evaluator.verdicts import Verdicts
     from jawusd.fitting.face_judging import JudgedFace
-    from jawusd.formats.alignment import Alignment
-    from jawusd.formats.face_table import FaceTable
 
 
 _GUESSES = {"chin": "a chin rigid with the bone", "mean": "the mean d", "carried": "the last d"}
@@ -101,9 +105,6 @@ def skin_fit(
     Points must be relative to the head: stabilised, or with --rigid head=MARKERS. The take must contain the jaw
     exercises, speech with visible teeth, every expression, and a few seconds of occlusion (--bite).
     """
-    import math
-
-    from jawusd.cli.options import rigid_bodies
     from jawusd.pipeline.skin import read_face
 
     refuse_existing(out, force)
@@ -150,8 +151,6 @@ def _learn(
     weights: bool = False,
 ) -> None:
     """Learn d from a face, or from its four jaw weights alone, and write and print the result."""
-    import jawusd
-    from jawusd.cli.animate_commands import rate_of
     from jawusd.pipeline.skin import learn_jaw_weights, learn_skin, read_jaw
 
     loaded = jawusd.load(rig, prim=prim)
@@ -199,10 +198,6 @@ def align(
     The rig provides the lower incisal point, first molars and condyles; other points, such as the chin, need their
     position in the skull frame. The command prints the expected error at the teeth and the condyles.
     """
-    import jawusd
-    from jawusd.base.errors import naming_file
-    from jawusd.formats.alignment import load_correspondences, save_alignment
-
     refuse_existing(out, force)
     loaded, given = jawusd.load(rig, prim=prim), load_correspondences(correspondences)
     points = given.points
@@ -263,7 +258,6 @@ class FaceOptions(NamedTuple):
 
 def validate_face(rig: Path, face: Path, options: FaceOptions, prim: str | None, as_json: bool) -> None:
     """Print the verdicts on a face track, and write their table and strip; exit code 1 if a frame is invalid."""
-    import jawusd
     from jawusd.fitting.face_judging import save_verdicts
 
     refuse_any(options.force, options.csv, options.strip)
@@ -285,18 +279,12 @@ def validate_face(rig: Path, face: Path, options: FaceOptions, prim: str | None,
 
 
 def _judged(rig: JawRig, face: Path, options: FaceOptions) -> JudgedFace:
-    import numpy as np
-
     from jawusd.fitting.face_judging import JudgedFace, judge_jaw_track
-    from jawusd.formats.alignment import load_alignment
-    from jawusd.formats.face_table import header_of
 
     if face.suffix.lower() == ".csv" and "timecode" in header_of(face):
-        from jawusd.cli.animate_commands import read_face
-
         if options.align is not None:
             raise typer.BadParameter("does not apply to ARKit weights.", param_hint="--align")
-        motion = read_face(rig, face, None, options.mapping)
+        motion = read_arkit_motion(rig, face, None, options.mapping)
         known = np.isfinite(motion.d).all(axis=1)
         T = rig.pose(motion.d[known])
         verdicts = rig.validate(T, residual_limit_mm=options.residual_mm, tolerance_mm=options.tolerance_mm)
@@ -328,7 +316,5 @@ def _verdict_rows(frames: Array | NDArray[np.int64], verdicts: Verdicts) -> list
 
 def verdict_lines(rows: Sequence[Mapping[str, object]]) -> list[str]:
     """Return a line for each frame that is not inside the bound."""
-    from jawusd.evaluator.verdicts import INSIDE
-
     shown = "frame {frame}: {reason} (residual {residual_mm:.2f} mm, margin {margin_mm:.2f} mm)"
     return [shown.format(**row) for row in rows if row["reason"] != INSIDE]

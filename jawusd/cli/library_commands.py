@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 import typer
 
+from jawusd.cli.motion import carried_over, emit_motion
 from jawusd.cli.options import Allow, Force, Json, Prim, PrimName, rig_of_folder
 from jawusd.cli.output import emit, progress
 from jawusd.formats.atomic import refuse_existing
-
-if TYPE_CHECKING:
-    from jawusd.library.index import Entry, Library
-
+from jawusd.formats.landmarks import load_landmarks
+from jawusd.formats.model import save_model
+from jawusd.library.index import PARAMETERS, Entry, Library
+from jawusd.library.personal import landmark_distance_mm
 
 #: Ways to combine the subjects of a library.
 Use = Literal["average", "closest"]
@@ -67,7 +69,6 @@ def _retarget_motion(
     force: bool,
     as_json: bool,
 ) -> None:
-    from jawusd.cli.motion import carried_over, emit_motion
     from jawusd.pipeline.library import load_any_rig
     from jawusd.rig import write_animation
     from jawusd.rig.read import describe
@@ -84,7 +85,6 @@ def _retarget_motion(
 
 
 def _personal(landmarks: Path, folder: Path, use: Use, out: Path, force: bool, as_json: bool) -> None:
-    from jawusd.formats.model import save_model
     from jawusd.pipeline.fit import fit_summary
     from jawusd.pipeline.library import open_library, personal_rig
 
@@ -131,8 +131,6 @@ def library(
     as_json: Json = False,
 ) -> None:
     """Manage many actors: update the index library.json, list, search, compare and plot."""
-    from dataclasses import asdict
-
     from jawusd.pipeline.library import add_rig, open_library, plot_ranges
 
     if compare is not None and (search, like, plot) != (None, None, None):
@@ -149,9 +147,6 @@ def library(
     entries = opened.entries if search is None else opened.search(search)
     apart_mm: dict[str, float] = {}
     if like is not None:
-        from jawusd.formats.landmarks import load_landmarks
-        from jawusd.library.personal import landmark_distance_mm
-
         wanted = load_landmarks(like).landmarks
         apart_mm = {entry.path: landmark_distance_mm(entry.landmarks(), wanted) for entry in entries}
         entries = tuple(sorted(entries, key=lambda entry: apart_mm[entry.path]))
@@ -162,8 +157,6 @@ def library(
 
 
 def _library_lines(opened: Library, entries: Sequence[Entry], apart_mm: Mapping[str, float]) -> list[str]:
-    from jawusd.library.index import PARAMETERS
-
     lines = [f"{'actor':<20}{'opening':>9}{'right':>8}{'left':>7}{'back':>7}{'forward':>9}{'condyles':>10}  file [mm]"]
     for entry in entries:
         (_, opening), (right, left), (back, forward) = (entry.ranges_mm[name] for name in PARAMETERS)
@@ -176,9 +169,6 @@ def _library_lines(opened: Library, entries: Sequence[Entry], apart_mm: Mapping[
 
 
 def _compare(first: Entry, second: Entry, as_json: bool) -> None:
-    from jawusd.library.index import PARAMETERS
-    from jawusd.library.personal import landmark_distance_mm
-
     def numbers(entry: Entry) -> dict[str, float]:
         ends = {f"{key}_{end}": entry.ranges_mm[key][i] for key in PARAMETERS for i, end in enumerate(("min", "max"))}
         return {

@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
+import numpy as np
 import typer
+from numpy.typing import NDArray
 
+import jawusd
+from jawusd.base.arrays import Array
+from jawusd.base.plugin_path import VARIABLE, schema_folder
 from jawusd.cli.face_commands import (
     NO,
     AlignOption,
@@ -19,6 +26,7 @@ from jawusd.cli.face_commands import (
     validate_face,
     verdict_lines,
 )
+from jawusd.cli.motion import read_pose_table
 from jawusd.cli.options import (
     USD_SUFFIXES,
     Allow,
@@ -31,14 +39,15 @@ from jawusd.cli.options import (
     load_named,
 )
 from jawusd.cli.output import emit
+from jawusd.cli.text_build import contact_words, frame_lines, joint_words, track_lines
+from jawusd.evaluator import JawRig, Reason
+from jawusd.evaluator.arrays import HeldOut
+from jawusd.formats.finding import Finding as Changed
+from jawusd.formats.poses import read_poses_or_parameters
+from jawusd.formats.tracks import load_tracks
+from jawusd.geometry import LANDMARKS, transform_point, transform_points
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
-    from jawusd.base.arrays import Array
-    from jawusd.evaluator import JawRig
-    from jawusd.formats.finding import Finding as Changed
     from jawusd.rig.read import Description
 
 Triple = tuple[float, float, float]
@@ -63,8 +72,6 @@ def info(
     if rig is None:
         raise typer.BadParameter("give a rig file or tracks, or --schema.", param_hint="RIG")
     if rig.suffix == ".npz":
-        from jawusd.cli.text_build import frame_lines, track_lines
-        from jawusd.formats.tracks import load_tracks
         from jawusd.pipeline.track import frame_summary, track_summary
 
         tracks = load_tracks(rig)
@@ -87,8 +94,6 @@ def info(
 
 
 def _print_schema(as_json: bool) -> None:
-    from jawusd.base.plugin_path import VARIABLE, schema_folder
-
     folder = str(schema_folder() or "")
     lines = [
         f"JawRigAPI: {folder or 'not installed'}",
@@ -99,9 +104,6 @@ def _print_schema(as_json: bool) -> None:
 
 
 def _info_lines(found: Description) -> list[str]:
-    from jawusd.cli.text_build import contact_words, joint_words
-    from jawusd.evaluator.arrays import HeldOut
-
     lines = [
         f"actor {found['actor']}, format {found['format_version']}, prim {found['prim']}",
         f"model: {found['model']['kind']} ({found['model']['method']}), onnx: {', '.join(found['onnx']) or 'none'}",
@@ -147,10 +149,6 @@ def pose(
     as_json: Json = False,
 ) -> None:
     """Print the jaw pose at parameters d: 4x4 matrix, twist, landmarks, tooth clearance, and margin to the bound."""
-    import jawusd
-    from jawusd.evaluator import Reason
-    from jawusd.geometry import LANDMARKS, transform_points
-
     loaded = jawusd.load(rig, prim=prim)
     _check_finite(d, "--d")
     T = loaded.pose(d)
@@ -178,8 +176,6 @@ def pose(
 
 
 def _check_finite(values: Triple, option: str) -> None:
-    import math
-
     if not all(math.isfinite(value) for value in values):
         raise typer.BadParameter("values must be finite", param_hint=option)
 
@@ -253,9 +249,6 @@ def _unbaked(rig: JawRig, path: Path, prim: str | None) -> dict[str, list[str] |
 
 
 def _poses_or_parameters(rig: JawRig, path: Path, prim: str | None) -> tuple[NDArray[np.int64], Array]:
-    from jawusd.cli.motion import read_pose_table
-    from jawusd.formats.poses import read_poses_or_parameters
-
     if path.suffix.lower() in USD_SUFFIXES:
         from jawusd.rig.motion_read import read_poses_of_stage
 
@@ -267,8 +260,6 @@ def _poses_or_parameters(rig: JawRig, path: Path, prim: str | None) -> tuple[NDA
 
 
 def _validate_rig(path: Path, changed: list[Changed], as_json: bool) -> None:
-    from dataclasses import asdict
-
     from jawusd.rig import Finding, find_nvidia_validator, nvidia_findings, validate_stage
     from jawusd.rig.layout import rig_prims
     from jawusd.rig.read import open_stage
@@ -305,9 +296,6 @@ def ik(
     as_json: Json = False,
 ) -> None:
     """Find the valid parameters that move a point of the mandible closest to a target."""
-    import jawusd
-    from jawusd.geometry import transform_point
-
     for values, option in ((point, "--point"), (target, "--target"), (start or point, "--start")):
         _check_finite(values, option)
     loaded = jawusd.load(rig, prim=prim)

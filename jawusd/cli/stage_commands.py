@@ -8,17 +8,21 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
+import numpy as np
 import typer
 
+from jawusd.base.arrays import Array
 from jawusd.base.errors import JawusdError
+from jawusd.cli.motion import AuthoredMotion, Changes, kept_inside, read_pose_table
 from jawusd.cli.options import USD_SUFFIXES, Allow, Force, Json, Prim, RigArg, load_named, rig_of_folder
 from jawusd.cli.output import emit
+from jawusd.evaluator import JawRig
 from jawusd.formats.atomic import refuse_existing
+from jawusd.formats.poses import PARAMETER_COLUMNS, write_table
+from jawusd.geometry import transform_points
+from jawusd.plugins.conversion import SUFFIXES, converted
 
 if TYPE_CHECKING:
-    from jawusd.base.arrays import Array
-    from jawusd.cli.motion import AuthoredMotion, Changes
-    from jawusd.evaluator import JawRig
     from jawusd.rig.rebake import StageMotion
 
 
@@ -54,11 +58,6 @@ def encode(
     In a stage, the mandible may be moved by transforms, bones or a point cache; `jawusd rebake` writes the result back.
     FBX and glTF are read through Blender.
     """
-    import numpy as np
-
-    from jawusd.cli.motion import read_pose_table
-    from jawusd.formats.poses import PARAMETER_COLUMNS, write_table
-
     refuse_existing(out, force)
     loaded = load_named(rig, prim, poses)
     if holds_stage(poses):
@@ -108,7 +107,6 @@ def read_stage_motion(
     Raises:
         JawusdError: the stage has no such motion.
     """
-    from jawusd.plugins.conversion import SUFFIXES, converted
     from jawusd.rig import describe
     from jawusd.rig.rebake import motion_of_stage
     from jawusd.rig.stage_poses import carries_rig
@@ -129,8 +127,6 @@ def read_stage_motion(
 
 def holds_stage(path: Path) -> bool:
     """Return whether a file is a stage, or can be converted to one by Blender."""
-    from jawusd.plugins.conversion import SUFFIXES
-
     return path.suffix.lower() in (*USD_SUFFIXES, *SUFFIXES)
 
 
@@ -156,8 +152,6 @@ def _refuse_model(rig: Path) -> None:
 
 def judged_motion(rig: JawRig, frames: Array, d: Array, residual_mm: Array) -> dict[str, float]:
     """Return statistics of a motion's distances from the model and from the bound."""
-    import numpy as np
-
     known = np.isfinite(d).all(axis=1)
     margin = np.where(known, rig.margin(d), np.inf)
     outside = known & ~rig.is_inside(d)
@@ -176,10 +170,6 @@ def judged_motion(rig: JawRig, frames: Array, d: Array, residual_mm: Array) -> d
 
 def moved_mm(rig: JawRig, d: Array) -> float:
     """Return the maximum displacement of a landmark from its position in the first pose of a motion d (F, 3) [mm]."""
-    import numpy as np
-
-    from jawusd.geometry import transform_points
-
     places = transform_points(rig.pose(d[np.isfinite(d).all(axis=1)]), rig.landmarks)
     return float(np.linalg.norm(places - places[:1], axis=-1).max(initial=0.0))
 
@@ -274,8 +264,6 @@ def _bake_rig(
     skull: str | None,
     origin: Origin | None,
 ) -> _BakedRig:
-    from jawusd.cli.motion import AuthoredMotion, kept_inside
-
     loaded = load_named(rig, prim, shot)
     found = read_stage_motion(loaded, rig, shot, prim, mandible, skull, origin)
     motion, changes = kept_inside(loaded, AuthoredMotion(found.frames, found.d, found.fps))
@@ -286,8 +274,6 @@ def _write_baked(
     out: Path, rig: Path, shot: Path, taken: Sequence[_BakedRig], root: bool, prim: str | None
 ) -> list[str]:
     """Write the layer; return the prims for which the shot's own layer has stronger opinions."""
-    import numpy as np
-
     from jawusd.rig import write_animation
     from jawusd.rig.rebake import Rebaked, write_over, write_rebaked
 
