@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from jawusd.base.arrays import Array
-from jawusd.evaluator.curve_formula import spline
+from jawusd.evaluator.curve_formula import curve_derivatives, spline
 from jawusd.evaluator.gauge import (
     INVERSE_ITERATIONS,
     INVERSE_STEP_MM,
@@ -48,10 +48,8 @@ def _glide(table: object, d2: Tensor, d3: Tensor) -> tuple[Tensor, Tensor, Tenso
 
 def _curve(module: MotionModule, name: str, x: Tensor) -> tuple[Tensor, Tensor]:
     """Return the points and derivatives (n, k) of a module's curve at x (n, 1)."""
-    parts = [module.get_buffer(f"{name}_{part}") for part in ("start", "power0", "power1", "power2", "power3")]
-    (start,), (c0,), (c1,), (c2,), (c3,) = OPERATIONS.lookup(x, module.get_buffer(f"{name}_knot"), parts)
-    s = x - start
-    return ((c3 * s + c2) * s + c1) * s + c0, (3.0 * c3 * s + 2.0 * c2) * s + c1
+    (point,), (slope,), _ = curve_derivatives(name, x, module.tables(), OPERATIONS)
+    return point, slope
 
 
 TENSORS: Elementary[Tensor] = Elementary(torch.sqrt, torch.exp, OPERATIONS.clip, _glide)
@@ -97,11 +95,14 @@ class AnchoredMotion(MotionModule):
         q = torch.stack(sheared, dim=1)
         away = q[:, None] - self.centres
         r = away.norm(dim=2)
-        columns = triple(q.split(1, dim=1))
         rows = [tail[i].unbind() for i in range(3)]
-        omega = torch.cat(spline(columns, self.centres, self.weights, rows, spread, OPERATIONS), dim=1) - offset
+        omega = (
+            torch.cat(spline(triple(q.split(1, dim=1)), self.centres, self.weights, rows, spread, OPERATIONS), dim=1)
+            - offset
+        )
         by_q = 3.0 * self.weights.T @ (away * r[:, :, None]) + tail.T
-        by_u = torch.stack(gradient_by_u(triple(by_q.unbind(dim=2)), scales, _columns(slopes)), dim=2)
+        columns = slopes[0][:, None], slopes[1][:, None]
+        by_u = torch.stack(gradient_by_u(triple(by_q.unbind(dim=2)), scales, columns), dim=2)
         R, J = _rotations(omega)
         moved = x + incisor
         turning = J @ by_u
@@ -202,10 +203,6 @@ def chart_of(kind: str, arrays: Mapping[str, Array]) -> AnchoredMotion | DirectM
     if kind == ANCHORED:
         return AnchoredMotion(arrays)
     return AdditiveMotion(kind, arrays) if kind == ADDITIVE else DirectMotion(kind, arrays)
-
-
-def _columns(slopes: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
-    return slopes[0][:, None], slopes[1][:, None]
 
 
 def _next_opening(x: Tensor, step: Tensor, low: Tensor, high: Tensor, iteration: int) -> Tensor:

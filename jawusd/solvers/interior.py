@@ -11,7 +11,7 @@ from torch import Tensor
 from jawusd.base.arrays import Array, Mask
 from jawusd.base.errors import EvaluatorError
 from jawusd.evaluator.bounds import SliceHull
-from jawusd.evaluator.curve_formula import curve, curve_tables
+from jawusd.evaluator.curve_formula import curve_derivatives, curve_tables
 from jawusd.evaluator.curves import HermiteCurve, flat_ended
 from jawusd.solvers.hull import Hull
 from jawusd.solvers.motion import OPERATIONS, Formula
@@ -62,7 +62,8 @@ class Interior(Formula):
         inward = -at.gradient
         # implicit function theorem on x = c(d1) + z m(d1, x)
         by_d1 = slope + side * inward[:, :1]
-        direct = torch.cat([by_d1[:, :, None] * (0.5 * (high - low) / root**3)[..., None], self._sideways(mu)], dim=2)
+        sideways = mu[..., None] * torch.eye(3, dtype=z.dtype, device=z.device)[:, 1:]
+        direct = torch.cat([by_d1[:, :, None] * (0.5 * (high - low) / root**3)[..., None], sideways], dim=2)
         across = torch.cat([torch.zeros_like(root), inward[:, 1:]], dim=1)
         lead = (across[:, None] @ direct) / (1.0 - (across * side).sum(dim=1))[:, None, None]
         return d, direct + side[:, :, None] * lead
@@ -78,17 +79,8 @@ class Interior(Formula):
 
     def _on_line(self, d1: Tensor) -> tuple[Tensor, Tensor]:
         """Return the points (n, 3) [mm] of the centre line at d1 (n, 1), and their derivatives."""
-        parts = [self.get_buffer(f"middle_{part}") for part in ("start", "power0", "power1", "power2", "power3")]
-        (start,), _, (c1,), (c2,), (c3,) = OPERATIONS.lookup(d1, self.get_buffer("middle_knot"), parts)
-        s = d1 - start
-        (at,) = curve("middle", d1, self.tables(), OPERATIONS)
-        slope = (3.0 * c3 * s + 2.0 * c2) * s + c1
+        (at,), (slope,), _ = curve_derivatives("middle", d1, self.tables(), OPERATIONS)
         return torch.cat([d1, at], dim=1), torch.cat([torch.ones_like(d1), slope], dim=1)
-
-    @staticmethod
-    def _sideways(mu: Tensor) -> Tensor:
-        zero = torch.zeros_like(mu)
-        return torch.stack([torch.cat([zero, zero], 1), torch.cat([mu, zero], 1), torch.cat([zero, mu], 1)], dim=1)
 
 
 def _middles(bound: SliceHull) -> Array:
