@@ -90,11 +90,12 @@ def _no_frames() -> tuple[NDArray[np.int64], Array, Array, Mask]:
 @explain_missing_packages()
 def plot_ranges(entries: Sequence[Entry], folder: Path, force: bool) -> list[Path]:
     """Plot the ranges of motion of a library's subjects side by side, as PNG and SVG; return the files."""
-    from jawusd.report.figures import RANGES, draw_ranges
+    from jawusd.report.figures import RANGES, ranges_figure
+    from jawusd.report.style import save_figure
 
     for suffix in (".png", ".svg"):
         refuse_existing(folder / (RANGES + suffix), force)
-    return draw_ranges([(entry.actor, entry.ranges_mm) for entry in entries], folder)
+    return save_figure(ranges_figure([(entry.actor, entry.ranges_mm) for entry in entries]), folder, RANGES)
 
 
 @dataclass(frozen=True, eq=False)

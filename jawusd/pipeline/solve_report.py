@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from jawusd.base.errors import FormatError, OutputError, explain_missing_packages, naming_file
+from jawusd.formats.atomic import write_text_atomic
 from jawusd.formats.capture import Capture
 from jawusd.formats.performance import SolveState
 from jawusd.formats.report import Overlay, SolveReportData
@@ -79,7 +80,7 @@ def write_solve_report(
         MissingDependencyError: matplotlib or jinja2 is not installed.
         OutputError: the page cannot be written.
     """
-    from jawusd.report.solve_page import write_solve_page
+    from jawusd.report.solve_page import solve_page
 
     progress("report", 0, 2)
     left_out: list[str] = []
@@ -104,7 +105,7 @@ def write_solve_report(
         left_out=tuple(left_out),
     )
     make_folder(Path(page).resolve().parent)
-    write_solve_page(page, data)
+    write_text_atomic(page, solve_page(data))
     progress("report", 2, 2)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import os
 from collections.abc import Mapping
 from typing import cast
@@ -20,7 +19,7 @@ from jawusd.formats.tracks import LOST, LostReason
 from jawusd.report.figures import human_ranges, model_figure, tracking_figure
 from jawusd.report.replay import replay_data
 from jawusd.report.style import inline_svg
-from jawusd.report.templates import package_file, page_environment
+from jawusd.report.templates import base64_text, package_file, page_environment
 from jawusd.report.verdicts import MARKS, WORDS, judge, summary
 
 _LISTED = 60  # maximum number of frame ranges in a list
@@ -59,8 +58,8 @@ def document(data: ReportData, figures: Mapping[str, Markup] | None = None) -> s
             script=package_file("scene.js") + package_file("timeline.js") + package_file("replay.js"),
             replay=replay_data(data),
             figures=draw_figures(data) if figures is None else figures,
-            pictures=[(one, base64.b64encode(one.jpeg).decode("ascii")) for one in data.overlays],
-            contacts=[(one, base64.b64encode(one.jpeg).decode("ascii")) for one in data.contacts],
+            pictures=[(one, base64_text(one.jpeg)) for one in data.overlays],
+            contacts=[(one, base64_text(one.jpeg)) for one in data.contacts],
             paper=(DEEP, *TOUCHING),
             ranges=human_ranges(data.tracks, data.model),
             errors=_error_tables(data),

@@ -34,7 +34,6 @@ from jawusd.report.style import (
     VERMILION,
     figure_bytes,
     new_figure,
-    save_figure,
 )
 from jawusd.report.verdicts import GOOD, LOOK
 
@@ -64,7 +63,7 @@ def tracking_figure(tracks: Tracks) -> Figure:
     figure, axes = new_figure(11.0, 7.4, 4, 1, sharex=True, height_ratios=[1.15, 1, 1, 1])
     _draw_state(axes[0], tracks)
     residual = np.where(tracks.status == LOST, np.nan, tracks.residual_px)
-    coverage = 100 * _mean_of_known(used_coverage(tracks), 2)
+    coverage = 100 * _mean_of_cameras(used_coverage(tracks))
     for index, (name, color, style) in enumerate((("upper teeth", ORANGE, "-"), ("lower teeth", BLUE, "--"))):
         axes[1].plot(*thinned(tracks.frames, residual[:, index], np.fmax), style, color=color, lw=1, label=name)
         axes[2].plot(*thinned(tracks.frames, coverage[:, index], np.fmax), style, color=color, lw=1, label=name)
@@ -117,11 +116,16 @@ def _draw_state(axis: Axes, tracks: Tracks) -> None:
         for arch, low in ((0, 0.04), (1, -0.4)):
             spans = runs(tracks.frames, has[:, arch])
             axis.broken_barh(spans, (low - lane, 0.36), facecolors=color, edgecolors=color, linewidth=0.8)
-        axis.axhline(-lane - 0.5, color=GREY, lw=0.4)
-    shares = [f"{name}  {int(has.any(1).sum())}" for name, has in zip(_LANES, states, strict=True)]
-    axis.set_yticks([-lane for lane in range(len(_LANES))], shares)
-    axis.set_ylim(0.5 - len(_LANES), 0.5)
+    name_lanes(axis, [f"{name}  {int(has.any(1).sum())}" for name, has in zip(_LANES, states, strict=True)])
     axis.set_title("frames in each state (upper half of a bar: upper teeth, lower half: lower teeth)", loc="left")
+
+
+def name_lanes(axis: Axes, names: list[str]) -> None:
+    """Name the lanes of a plot, which are one unit high, downwards from 0, and separate them by lines."""
+    axis.set_yticks([-lane for lane in range(len(names))], names)
+    axis.set_ylim(0.5 - max(len(names), 1), 0.5)
+    for lane in range(len(names)):
+        axis.axhline(-lane - 0.5, color=GREY, lw=0.4)
 
 
 def runs(frames: NDArray[np.int64], has: Mask) -> list[tuple[float, float]]:
@@ -131,10 +135,10 @@ def runs(frames: NDArray[np.int64], has: Mask) -> list[tuple[float, float]]:
     return [(float(frames[a]) - 0.5, float(frames[b - 1] - frames[a]) + 1.0) for a, b in spans]
 
 
-def _mean_of_known(values: Array, axis: int) -> Array:
+def _mean_of_cameras(values: Array) -> Array:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # the mean is undefined in frames without any mask
-        return np.nanmean(values, axis=axis)
+        return np.nanmean(values, axis=2)
 
 
 def larger_magnitude(a: Array, b: Array) -> Array:
@@ -284,15 +288,6 @@ def _row(name: str, value: float) -> RangeRow:
     else:
         remark, grade = "usual", GOOD
     return RangeRow(name, f"{value:.1f} {unit}", f"{low:g} to {high:g} {unit}", source, remark, grade)
-
-
-def draw_ranges(people: Sequence[tuple[str, dict[str, list[float]]]], folder: Path) -> list[Path]:
-    """Write the figure of `ranges_figure` to a folder as PNG and SVG; return the files.
-
-    Raises:
-        OutputError: a file cannot be written.
-    """
-    return save_figure(ranges_figure(people), folder, RANGES)
 
 
 def ranges_figure(people: Sequence[tuple[str, dict[str, list[float]]]]) -> Figure:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import os
 import zlib
 from collections.abc import Mapping
@@ -21,8 +20,8 @@ from jawusd.formats.atomic import write_text_atomic
 from jawusd.formats.mesh import DEEP, TOUCHING
 from jawusd.formats.report import ReplayPart
 from jawusd.geometry.se3 import se3_log, transform_points
-from jawusd.report.replay import TRACED, encoded, packed
-from jawusd.report.templates import package_file, page_environment
+from jawusd.report.replay import TRACED, encoded, framed, packed
+from jawusd.report.templates import base64_text, package_file, page_environment
 
 if TYPE_CHECKING:
     from jawusd.meshes.contact import Teeth
@@ -83,7 +82,7 @@ def _steps(values: NDArray[np.float32], low: float, high: float) -> NDArray[np.u
 
 def _deflated(values: NDArray[np.uint8] | NDArray[np.int16]) -> str:
     """Return the bytes of an array, compressed by zlib, as base64 text."""
-    return base64.b64encode(zlib.compress(np.ascontiguousarray(values).tobytes(), 9)).decode("ascii")
+    return base64_text(zlib.compress(np.ascontiguousarray(values).tobytes(), 9))
 
 
 _SCRIPTS = ("scene.js", "decoder.js", "contacts.js", "drag.js", "ghosts.js", "keys.js", "timeline.js", "pose.js")
@@ -145,8 +144,6 @@ def pose_data(page: PosePage) -> dict[str, object]:
     rig = page.rig
     d = np.stack(np.meshgrid(*page.axes, indexing="ij"), axis=-1).reshape(-1, 3)
     twists = se3_log(motions_of_poses(rig.pose(d), rig.T_anatomical_skull, rig.T_rest))
-    vertices = np.concatenate([part.mesh.vertices for part in page.parts if part.name != "skull"])
-    low, high = vertices.min(0), vertices.max(0)
     landmarks = transform_points(rig.T_anatomical_skull @ rig.T_rest, rig.landmarks)
     clearance = rig.contact
     captured = rig.captured_d[:: max(1, -(-len(rig.captured_d) // _MOST_CAPTURED))]
@@ -162,13 +159,10 @@ def pose_data(page: PosePage) -> dict[str, object]:
         "ghosts": {"captured": encoded(captured.astype("<f4")), "count": page.ghosts[0], "apart": page.ghosts[1]},
         "contact": None if clearance is None or page.teeth is None else contact_data(clearance, page.teeth),
         "footage": None if page.footage is None else _footage_data(page.footage),
-        "centre": (0.5 * (low + high)).round(2).tolist(),
-        "radius": round(float(np.linalg.norm(high - low)) / 2, 2),
+        **framed(page.parts),
     }
 
 
 def _footage_data(footage: PageFootage) -> dict[str, object]:
-    texts = {
-        name: [base64.b64encode(image).decode("ascii") for image in images] for name, images in footage.cameras.items()
-    }
+    texts = {name: list(map(base64_text, images)) for name, images in footage.cameras.items()}
     return {"cameras": texts, "first": footage.first, "step": footage.step}

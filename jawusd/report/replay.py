@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import base64
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,6 +14,7 @@ from jawusd.formats.keys import DEFAULT_FPS
 from jawusd.formats.report import ReplayPart, ReportData
 from jawusd.formats.tracks import LOST, PARTIAL, RECOVERED, Tracks
 from jawusd.geometry import transform_points
+from jawusd.report.templates import base64_text
 
 #: Names of the tracking states of frames.
 STATES = ("tracked", "recovered after a loss", "tracked without a camera", "lost", "regularised by the model")
@@ -38,9 +39,6 @@ def replay_data(data: ReportData) -> dict[str, object] | None:
     known = np.all(np.isfinite(d), axis=1)
     rig, margin = JawRig(model.arrays, model.meta), np.full(len(rows), np.nan)
     fitted[known], margin[known] = rig.pose(d[known]), rig.margin(d[known])
-    # The virtual camera is aimed at the jaw; the skull is ignored.
-    jaw = [part.mesh.vertices for part in data.parts if part.name != "skull"] or [data.parts[0].mesh.vertices]
-    low, high = np.concatenate(jaw).min(0), np.concatenate(jaw).max(0)
     A, rest = model.arrays["T_anatomical_skull"], model.arrays["T_rest"]
     landmarks = transform_points(A @ rest, model.arrays["landmarks"])
     return {
@@ -54,8 +52,7 @@ def replay_data(data: ReportData) -> dict[str, object] | None:
         "state": encoded(_states(tracks)[rows]),
         "states": list(STATES),
         "fps": float(data.model.notes.get("fps") or DEFAULT_FPS) / step,
-        "centre": (0.5 * (low + high)).round(2).tolist(),
-        "radius": round(float(np.linalg.norm(high - low)) / 2, 2),
+        **framed(data.parts),
         "traced": landmarks[list(TRACED)].round(3).tolist(),
     }
 
@@ -97,4 +94,11 @@ def packed(part: ReplayPart) -> dict[str, object]:
 
 def encoded(values: ArrayLike) -> str:
     """Return the bytes of an array as base64 text."""
-    return base64.b64encode(np.ascontiguousarray(values).tobytes()).decode("ascii")
+    return base64_text(np.ascontiguousarray(values).tobytes())
+
+
+def framed(parts: Sequence[ReplayPart]) -> dict[str, object]:
+    """Return the centre and the radius [mm] of the jaw, without the skull: there, the virtual camera is aimed."""
+    jaw = [part.mesh.vertices for part in parts if part.name != "skull"] or [parts[0].mesh.vertices]
+    low, high = np.concatenate(jaw).min(0), np.concatenate(jaw).max(0)
+    return {"centre": (0.5 * (low + high)).round(2).tolist(), "radius": round(float(np.linalg.norm(high - low)) / 2, 2)}

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import base64
-import os
 from functools import partial
 from typing import NamedTuple
 
@@ -17,14 +15,13 @@ from numpy.typing import ArrayLike, NDArray
 from jawusd.base.arrays import Array
 from jawusd.base.errors import FormatError
 from jawusd.evaluator.verdicts import is_inside
-from jawusd.formats.atomic import write_text_atomic
 from jawusd.formats.finding import Finding
 from jawusd.formats.performance import STATE_WORDS, SolvedJaw, SolveState
 from jawusd.formats.report import SolveReportData
 from jawusd.formats.tracks import LOST, Tracks
-from jawusd.report.figures import larger_magnitude, legend_beside, runs, thinned
+from jawusd.report.figures import larger_magnitude, legend_beside, name_lanes, runs, thinned
 from jawusd.report.style import BLACK, BLUE, GREEN, GREY, MAGENTA, ORANGE, SKY, VERMILION, inline_svg, new_figure
-from jawusd.report.templates import package_file, page_environment
+from jawusd.report.templates import base64_text, package_file, page_environment
 
 #: Colours of the solve states: close to those of the outlines in the images, but legible on light and dark pages.
 STATE_INKS = {SolveState.SOLVED: GREEN, SolveState.SKIN: SKY, SolveState.CARRIED: ORANGE, SolveState.LOST: MAGENTA}
@@ -71,14 +68,14 @@ def observation_figure(tracks: Tracks, solved: SolvedJaw, fps: float) -> Figure:
     figure, axes = new_figure(11.0, height, 2, 1, sharex=True, height_ratios=[len(lanes), max(len(names), 1)])
     for lane, (_, has, ink) in enumerate(lanes):
         axes[0].broken_barh(runs(frames, has), (-lane - 0.4, 0.8), facecolors=ink, edgecolors=ink, linewidth=0.8)
-    _name_lanes(axes[0], [f"{name}  {int(has.sum())}" for name, has, _ in lanes])
+    name_lanes(axes[0], [f"{name}  {int(has.sum())}" for name, has, _ in lanes])
     axes[0].set_title("frames in each state", loc="left")
     for lane in range(len(names)):
         for arch, low in ((0, 0.02), (1, -0.4)):
             spans = runs(frames, tracks.masks_used[:, arch, lane] & (tracks.status[:, arch] != LOST))
             axes[1].broken_barh(spans, (low - lane, 0.38), facecolors=BLUE, edgecolors=BLUE, linewidth=0.8)
     used = tracks.masks_used.any(axis=1).sum(axis=0) if len(names) else []
-    _name_lanes(axes[1], [f"{name}  {count}" for name, count in zip(names, used, strict=True)])
+    name_lanes(axes[1], [f"{name}  {count}" for name, count in zip(names, used, strict=True)])
     axes[1].set_title("masks used (upper half of a bar: upper teeth, lower half: lower teeth)", loc="left")
     _label_frames(axes[0], axes[1], fps)
     return figure
@@ -100,13 +97,6 @@ def _shade(axis: Axes, frames: NDArray[np.int64], solved: SolvedJaw) -> None:
         spans = runs(frames, solved.state == state)
         over = axis.get_xaxis_transform()
         axis.broken_barh(spans, (0, 1), transform=over, facecolors=STATE_INKS[state], alpha=0.22, linewidth=0, zorder=0)
-
-
-def _name_lanes(axis: Axes, names: list[str]) -> None:
-    axis.set_yticks([-lane for lane in range(len(names))], names)
-    axis.set_ylim(0.5 - max(len(names), 1), 0.5)
-    for lane in range(len(names)):
-        axis.axhline(-lane - 0.5, color=GREY, lw=0.4)
 
 
 def _label_frames(top: Axes, bottom: Axes, fps: float) -> None:
@@ -131,16 +121,6 @@ class UnobservedRun(NamedTuple):
     sigma: str
 
 
-def write_solve_page(path: str | os.PathLike[str], data: SolveReportData) -> None:
-    """Write the report to an HTML file.
-
-    Raises:
-        FormatError: the tracks do not come from a solve.
-        OutputError: the file cannot be written.
-    """
-    write_text_atomic(path, solve_page(data))
-
-
 def solve_page(data: SolveReportData) -> str:
     """Return the report as HTML, with text from files escaped.
 
@@ -162,7 +142,7 @@ def solve_page(data: SolveReportData) -> str:
             sentence=_sentence(solved, bool(findings)),
             jaw=_jaw_rows(solved),
             figures=_figures(data, solved),
-            pictures=[(one, base64.b64encode(one.jpeg).decode("ascii")) for one in data.overlays],
+            pictures=[(one, base64_text(one.jpeg)) for one in data.overlays],
             unobserved=unobserved[:_LISTED],
             more=max(len(unobserved) - _LISTED, 0),
             cameras=_cameras(data),
@@ -203,16 +183,8 @@ def _counts(solved: SolvedJaw) -> list[tuple[str, int, str, str]]:
     """Return (name, frames, percentage, meaning) of every state and verdict."""
     rows = (
         ("solved", solved.state == SolveState.SOLVED, "both arches were found in the masks"),
-        (
-            "skin",
-            solved.state == SolveState.SKIN,
-            "an arch was not found; d is estimated from facial skin",
-        ),
-        (
-            "carried",
-            solved.state == SolveState.CARRIED,
-            "an arch was hidden; its pose is interpolated",
-        ),
+        ("skin", solved.state == SolveState.SKIN, "an arch was not found; d is estimated from facial skin"),
+        ("carried", solved.state == SolveState.CARRIED, "an arch was hidden; its pose is interpolated"),
         (
             "lost",
             solved.state == SolveState.LOST,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import math
 import re
 from importlib import resources
@@ -36,6 +37,11 @@ def worded(text: str) -> Markup:
 def figure(value: float) -> str:
     """Return a length in mm with three decimals, or a dash if it is unknown."""
     return f"{value:.3f}" if math.isfinite(value) else "\u2013"
+
+
+def base64_text(data: bytes) -> str:
+    """Return bytes as text for a page."""
+    return base64.b64encode(data).decode("ascii")
 
 
 def package_file(name: str) -> Markup:

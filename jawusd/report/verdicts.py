@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -87,19 +87,13 @@ def judge(data: ReportData) -> list[Verdict]:
     return [_sync(data), _track(data.tracks), _fit(data), _bounds(data), _rig(data)]
 
 
-def overall(verdicts: Iterable[Verdict]) -> str:
-    """Return the worst grade of several verdicts."""
-    return _worst([verdict.grade for verdict in verdicts])
-
-
-def summary(verdicts: Iterable[Verdict]) -> BuildVerdict:
+def summary(verdicts: Sequence[Verdict]) -> BuildVerdict:
     """Return the worst grade, advice on what to do, and the checks with that grade and their limits.
 
     The advice is ordered by grade, then by stage, since a fault affects the stages after it. The
     movements to record are listed in one sentence.
     """
-    verdicts = list(verdicts)
-    grade = overall(verdicts)
+    grade = _worst([verdict.grade for verdict in verdicts])
     checks = [(verdict.stage, check) for verdict in verdicts for check in verdict.checks]
     because = [
         f"{stage}: {check.name} {check.found}" + (f" ({check.limit})" if check.limit else "")

@@ -14,7 +14,7 @@ from report_data import experiments, report_data, solve_data, write_document
 from jawusd.formats.mesh import Mesh
 from jawusd.formats.report import Origin, ReplayPart
 from jawusd.report import document as report_document
-from jawusd.report.solve_page import write_solve_page
+from jawusd.report.solve_page import solve_page
 
 chromium = pytest.fixture(headless_chromium, scope="module")
 
@@ -128,7 +128,7 @@ def test_tables_are_folded_and_a_link_opens_them(chromium, tmp_path):
 def solved(tmp_path_factory):
     """Return the report of a performance."""
     path = tmp_path_factory.mktemp("solved") / "take.html"
-    write_solve_page(path, solve_data())
+    path.write_text(solve_page(solve_data()), encoding="utf-8")
     return path
 
 

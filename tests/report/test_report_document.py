@@ -75,7 +75,6 @@ def test_reasons_of_losses_are_listed_with_their_frames(words_alone):
     assert all(count > 0 for _, count, _ in _frame_lists(data))
 
 
-
 def test_outliers_are_listed_where_no_frame_was_excluded():
     data = report_data()
     meta = {**data.model.meta, "trimmed_frames": [22, 23, 30], "excluded_frames": {}}

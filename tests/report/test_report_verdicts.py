@@ -12,7 +12,7 @@ from jawusd.formats.finding import Finding
 from jawusd.formats.report import RigFacts, verdict_sentence
 from jawusd.paper.figures import coverage_figure
 from jawusd.report.figures import human_ranges, tracking_figure
-from jawusd.report.verdicts import BAD, GOOD, LOOK, judge, overall, summary
+from jawusd.report.verdicts import BAD, GOOD, LOOK, judge, summary
 
 
 def grades(data):
@@ -22,7 +22,7 @@ def grades(data):
 def test_a_good_build_is_good():
     verdicts = judge(report_data())
     assert [verdict.stage for verdict in verdicts] == ["sync", "track", "fit", "bounds", "rig"]
-    assert overall(verdicts) == GOOD, [c for v in verdicts for c in v.checks if c.grade != GOOD]
+    assert summary(verdicts)["grade"] == GOOD, [c for v in verdicts for c in v.checks if c.grade != GOOD]
 
 
 def test_bounds_state_how_many_held_out_frames_the_tolerance_covers():
