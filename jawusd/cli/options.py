@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -168,35 +169,42 @@ def rigid_bodies(given: list[str] | None) -> dict[str, str]:
     Raises:
         typer.BadParameter: an option is not of the form BODY=MARKERS, or a body is given twice.
     """
+    form = "jaw=MARKERS or head=MARKERS"
+    found = named_values(given, form, "--rigid")
+    for name, markers in found.items():
+        if name not in ("head", "jaw"):
+            raise typer.BadParameter(f'"{name}={markers}" is not of the form {form}.', param_hint="--rigid")
+    return found
+
+
+def named_values(given: Iterable[str] | None, form: str, option: str) -> dict[str, str]:
+    """Return the values by name of texts of the form NAME=VALUE.
+
+    Raises:
+        typer.BadParameter: a text is not of this form, or a name is given twice.
+    """
     found: dict[str, str] = {}
     for text in given or ():
-        name, sign, markers = (piece.strip() for piece in text.partition("="))
-        if not sign or not markers or name not in ("head", "jaw"):
-            raise typer.BadParameter(f'"{text}" is not of the form jaw=MARKERS or head=MARKERS.', param_hint="--rigid")
+        name, _, value = (piece.strip() for piece in text.partition("="))
+        if not name or not value:
+            raise typer.BadParameter(f'"{text}" is not of the form {form}.', param_hint=option)
         if name in found:
-            raise typer.BadParameter(f'"{name}" is given twice.', param_hint="--rigid")
-        found[name] = markers
+            raise typer.BadParameter(f'"{name}" is given twice.', param_hint=option)
+        found[name] = value
     return found
 
 
 def _column_map(text: str | None) -> dict[str, str]:
     from jawusd.formats.poses import MATRIX_COLUMNS, QUATERNION_COLUMNS
 
-    known = ("frame", *QUATERNION_COLUMNS, *MATRIX_COLUMNS)
-    found: dict[str, str] = {}
-    for part in (text or "").split(",") if text else ():
-        ours, sign, theirs = (piece.strip() for piece in part.partition("="))
-        if not sign or not theirs:
-            raise typer.BadParameter(f'"{part}" is not of the form name=column.', param_hint="--columns")
-        if ours not in known:
+    found = named_values(text.split(",") if text else None, "name=column", "--columns")
+    for name in found:
+        if name not in ("frame", *QUATERNION_COLUMNS, *MATRIX_COLUMNS):
             raise typer.BadParameter(
-                f'"{ours}" is not a column of poses; it must be one of frame, '
+                f'"{name}" is not a column of poses; it must be one of frame, '
                 f"{', '.join(QUATERNION_COLUMNS)}, m00 ... m33.",
                 param_hint="--columns",
             )
-        if ours in found:
-            raise typer.BadParameter(f'"{ours}" is given twice.', param_hint="--columns")
-        found[ours] = theirs
     return found
 
 

@@ -9,7 +9,7 @@ import re
 import sys
 import time
 import traceback
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, TextIO
@@ -56,6 +56,12 @@ def plain(value: object) -> object:
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return str(value) if isinstance(value, Path) else value
+
+
+def shortened(items: Sequence[object], most: int, more: str = "more") -> str:
+    """Return the first items as a list in words, and how many more there are."""
+    rest = f" and {len(items) - most} {more}" if len(items) > most else ""
+    return ", ".join(map(str, items[:most])) + rest
 
 
 def refuse_any(force: bool, *paths: Path | None) -> None:

@@ -177,10 +177,18 @@ def view(
     if footage and page is None:
         raise typer.BadParameter("--footage needs --page; the viewer always shows footage.")
     if page is not None:
-        _write_page(rig, page, force, prim, footage)
+        if capture:
+            raise typer.BadParameter("--page needs a rig, not a capture.")
+        from jawusd.pipeline.pose_page import write_page
+
+        refuse_existing(page, force)
+        write_page(rig, page, prim, footage=footage)
+        say(f"{page}  ({page.stat().st_size / 1e6:.1f} MB; opens in any browser)")
         return
     _warn_of_host(host, capture)
-    _name_changed_files(*(folder for folder in (rig, tracks) if folder is not None and folder.is_dir()))
+    for folder in (rig, tracks):
+        if folder is not None and folder.is_dir():
+            _name_changed_files(folder)
     if rig is not None and capture:
         _serve_capture(rig, tracks, host, port, browser, allow_outside)
     else:
@@ -195,12 +203,11 @@ def _is_capture(rig: Path | None) -> bool:
     return is_capture(rig)
 
 
-def _name_changed_files(*folders: Path) -> None:
-    for folder in folders:
-        from jawusd.pipeline.state import changed_files
+def _name_changed_files(folder: Path) -> None:
+    from jawusd.pipeline.state import changed_files
 
-        for found in changed_files(folder):
-            say(found.line(), err=True)
+    for found in changed_files(folder):
+        say(found.line(), err=True)
 
 
 def _serve_capture(
@@ -258,16 +265,6 @@ def _announce(browser: bool, url: str) -> None:
     say(f"{url}  (Ctrl+C stops)")
     if browser:
         webbrowser.open(url)
-
-
-def _write_page(rig: Path | None, page: Path, force: bool, prim: str | None, footage: bool) -> None:
-    from jawusd.pipeline.pose_page import write_page
-
-    if _is_capture(rig):
-        raise typer.BadParameter("--page needs a rig, not a capture.")
-    refuse_existing(page, force)
-    write_page(rig, page, prim, footage=footage)
-    say(f"{page}  ({page.stat().st_size / 1e6:.1f} MB; opens in any browser)")
 
 
 def _warn_of_host(host: str, capture: bool) -> None:

@@ -9,8 +9,20 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from jawusd.cli.face_commands import Fps, RestFrame, Rigid
-from jawusd.cli.options import Allow, Force, Jobs, Json, LengthUnit, Outside, Prim, RigArg, UnitOption, rigid_bodies
-from jawusd.cli.output import emit, progress, refuse_any, say
+from jawusd.cli.options import (
+    Allow,
+    Force,
+    Jobs,
+    Json,
+    LengthUnit,
+    Outside,
+    Prim,
+    RigArg,
+    UnitOption,
+    named_values,
+    rigid_bodies,
+)
+from jawusd.cli.output import emit, progress, refuse_any, say, shortened
 from jawusd.formats.finding import Finding
 
 if TYPE_CHECKING:
@@ -173,9 +185,8 @@ def solve_lines(summary: SolveSummary) -> list[str]:
         ("lost", summary["lost"]),
     ):
         if runs:
-            more = "" if len(runs) <= _LISTED_RUNS else f" and {len(runs) - _LISTED_RUNS} more runs"
-            listed = ", ".join(f"{a}" if a == b else f"{a}-{b}" for a, b in runs[:_LISTED_RUNS])
-            lines.append(f"  {word}: {sum(b - a + 1 for a, b in runs)} frames ({listed}{more})")
+            listed = shortened([f"{a}" if a == b else f"{a}-{b}" for a, b in runs], _LISTED_RUNS, "more runs")
+            lines.append(f"  {word}: {sum(b - a + 1 for a, b in runs)} frames ({listed})")
     if summary["within_tolerance"]:
         lines.append(f"  outside the rig's bound, within its tolerance: {summary['within_tolerance']} frames")
     if summary["outside"]:
@@ -229,7 +240,7 @@ def live(
     from jawusd.pipeline.view import open_viewer
 
     given = _skin_options(skin, face, face_fps, offset, rigid, rest_frame, length_unit)
-    sources = dict(_named(entry) for entry in source or [])
+    sources = named_values(source, "NAME=WHERE, such as mid=/dev/video0", "--source")
     sender = None if osc is None else OscSender(osc)
     viewer = open_viewer(rig, "127.0.0.1", port, prim, play=False) if view else None
     if viewer is not None:
@@ -265,10 +276,3 @@ def _show(results: Iterator[LiveFrame], sender: OscSender | None, viewer: Viewer
             sender.close()
         if viewer is not None:
             viewer.stop()
-
-
-def _named(entry: str) -> tuple[str, str]:
-    name, found, where = entry.partition("=")
-    if not found or not name or not where:
-        raise typer.BadParameter(f"{entry!r} is not of the form NAME=WHERE, such as mid=/dev/video0.")
-    return name, where

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
+from jawusd.cli.output import shortened
 from jawusd.cli.text_capture import calibration_lines
 from jawusd.evaluator.contact import AUTHORED_MM, NEAR_MM
 from jawusd.formats.finding import Finding
@@ -141,8 +142,7 @@ def track_lines(summary: TrackSummary) -> list[str]:
     lost = summary["lost"]
     lines = [f"tracked {summary['tracked']} of {summary['frames']} frames"]
     if lost:
-        more = "" if len(lost) <= _LISTED_FRAMES else f" and {len(lost) - _LISTED_FRAMES} more"
-        lines.append(f"  lost: {', '.join(map(str, lost[:_LISTED_FRAMES]))}{more}")
+        lines.append(f"  lost: {shortened(lost, _LISTED_FRAMES)}")
     for name, counts in summary.get("lost_reasons", {}).items():
         lines.append(f"  {name} arch lost by: " + ", ".join(f"{reason} {count}" for reason, count in counts.items()))
     lines.append(f"  recovered {summary['recovered']}, without one of the cameras {summary['without_a_camera']}")

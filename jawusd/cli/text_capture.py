@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jawusd.base.guard import SETTING
+from jawusd.cli.output import shortened
 from jawusd.formats.finding import Finding
 
 if TYPE_CHECKING:
@@ -39,7 +40,9 @@ def calibration_lines(report: CalibrationSummary) -> list[str]:
         line = (
             f"  {name}: {camera['rms_px']:.3f} px rms, {camera['views']} views, {camera['coverage']:.0%} of the image"
         )
-        lines.append(line + _listed("blurred", camera["blurred"]) + _listed("missed", camera["missed"]))
+        for word, images in (("blurred", camera["blurred"]), ("missed", camera["missed"])):
+            line += f"; {word}: {shortened(images, _LISTED)}" if images else ""
+        lines.append(line)
     shape = report["board_shape"]
     if shape["distances"]:
         lines.append(
@@ -53,13 +56,6 @@ def calibration_lines(report: CalibrationSummary) -> list[str]:
     if (ratio := report["scale"]["ratio"]) is not None:
         lines.append(f"  the teeth confirm the board's size: scale {ratio:.4f} (+-{report['scale']['sigma']:.4f})")
     return lines + [f"  note: {note}" for note in report["notes"]] + [f"  advice: {text}" for text in report["advice"]]
-
-
-def _listed(word: str, numbers: Sequence[int]) -> str:
-    if not numbers:
-        return ""
-    more = f" and {len(numbers) - _LISTED} more" if len(numbers) > _LISTED else ""
-    return f"; {word}: {', '.join(map(str, numbers[:_LISTED]))}{more}"
 
 
 def sync_lines(result: SyncResult) -> list[str]:
