@@ -6,8 +6,6 @@ from those of the CPU where a pixel centre lies within rounding error of a trian
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -114,18 +112,6 @@ def describe_graphics() -> str:
         context.release()
 
 
-@dataclass(frozen=True, eq=False)
-class _Target:
-    """A layered render target."""
-
-    texture: moderngl.TextureArray
-    frame: moderngl.Framebuffer
-
-    def release(self) -> None:
-        self.frame.release()
-        self.texture.release()
-
-
 class GlCounter:
     """Pixel counter on the GPU; releasing the context frees its memory.
 
@@ -146,7 +132,7 @@ class GlCounter:
                 index = context.buffer(np.ascontiguousarray(faces, np.int32))
                 array = context.vertex_array(self._program, [(buffer, "3f", "position")], index)
                 self._passes.append((shade, array))
-        self._targets: dict[int, _Target] = {}
+        self._targets: dict[int, tuple[moderngl.TextureArray, moderngl.Framebuffer]] = {}
         self._masks: moderngl.TextureArray | None = None
         self._most_layers = int(context.info["GL_MAX_ARRAY_TEXTURE_LAYERS"])
 
@@ -194,7 +180,7 @@ class GlCounter:
         matrices = self._gl.buffer(np.ascontiguousarray(clip, np.float32))
         counts = self._gl.buffer(np.zeros(2 * layers, np.uint32))
         try:
-            self._draw(self._target(layers), matrices, layers)
+            self._draw(matrices, layers)
             self._shown().use(1)
             counts.bind_to_storage_buffer(1)
             self._compute["views"], self._compute["size"] = views, (width, height)
@@ -205,30 +191,32 @@ class GlCounter:
             matrices.release()
             counts.release()
 
-    def _draw(self, target: _Target, matrices: moderngl.Buffer, layers: int) -> None:
+    def _draw(self, matrices: moderngl.Buffer, layers: int) -> None:
+        texture, frame = self._target(layers)
         self._gl.enable_only(self._flags)
         self._gl.front_face = "cw"  # flipped vertically: image row 0 is drawn to the bottom row of the render target
-        target.frame.use()
-        target.frame.clear()
+        frame.use()
+        frame.clear()
         matrices.bind_to_storage_buffer(0)
         for shade, array in self._passes:
             self._program["shade"] = shade
             array.render(instances=layers)
-        target.texture.use(0)
+        texture.use(0)
 
-    def _target(self, layers: int) -> _Target:
+    def _target(self, layers: int) -> tuple[moderngl.TextureArray, moderngl.Framebuffer]:
         """Return a render target with at least `layers` layers; cache several sizes, since clearing takes time."""
         width, height, views = self._shown().size
         room = min(1 << (layers - 1).bit_length(), self._most_layers)
         if room not in self._targets:
             texture = self._gl.texture_array((width, height, room), 1, dtype="f1")
             texture.filter = (moderngl.NEAREST, moderngl.NEAREST)
-            self._targets[room] = _Target(texture, self._gl.framebuffer([texture]))
+            self._targets[room] = texture, self._gl.framebuffer([texture])
         return self._targets[room]
 
     def _drop_textures(self) -> None:
-        for target in self._targets.values():
-            target.release()
+        for texture, frame in self._targets.values():
+            frame.release()
+            texture.release()
         self._targets.clear()
         if self._masks is not None:
             self._masks.release()

@@ -116,12 +116,6 @@ def from_prim(prim: Usd.Prim) -> Rig:
     return Rig(kind, {name: [x for key in keys for x in _flat(value(key))] for name, keys in attributes.items()})
 
 
-def from_json(text: str) -> Rig:
-    """Build a rig from the text of `Rig.to_json`."""
-    stored = json.loads(text)
-    return Rig(stored["kind"], stored["arrays"])
-
-
 def _flat(value: float | Sequence[float] | str) -> list[float]:
     return [float(value)] if isinstance(value, (int, float)) else [float(x) for x in value]
 
@@ -214,10 +208,6 @@ class Rig:
         self._spacing_mm = (last_mm - first_mm + 2.0 * beyond) / _SLICES
         self._openings = [first_mm - beyond + (i + 0.5) * self._spacing_mm for i in range(_SLICES)]
 
-    def to_json(self) -> str:
-        """Return the rig as text that can be stored in a scene; `from_json` reads it."""
-        return json.dumps({"kind": self.kind, "arrays": self.arrays})
-
     def pose(self, d1: float, d2: float, d3: float) -> Rows:
         """Return T_skull_mandible [mm] at jaw parameters [mm], as four rows of a matrix for column vectors."""
         motion = self.formula.motion((d1, d2, d3), self.formula.tables, _OPERATIONS)
@@ -273,14 +263,19 @@ class Rig:
         return along_d2, _chord(lambda x: self.margin(d1, d2, x), *self.d_range[2])
 
     def _nearest_opening(self, d1: float, d2: float, d3: float) -> float:
-        inside, outside = min(max(d1, self._bound.numbers.first_mm), self._bound.numbers.last_mm), d1
+        inside = min(max(d1, self._bound.numbers.first_mm), self._bound.numbers.last_mm)
         beyond = inside != d1 and self.d_range[0][0] <= d1 <= self.d_range[0][1]
         if not beyond or self.margin(d1, d2, d3) >= 0.0 or self.margin(inside, d2, d3) < 0.0:
             return d1
-        for _ in range(_SEARCH_STEPS):
-            middle = 0.5 * (inside + outside)
-            inside, outside = (inside, middle) if self.margin(middle, d2, d3) < 0.0 else (middle, outside)
-        return inside
+        return _zero(lambda x: self.margin(x, d2, d3), inside, d1)
+
+
+def _zero(margin: Callable[[float], float], inside: float, outside: float) -> float:
+    """Return where a margin becomes negative between two values, by bisection."""
+    for _ in range(_SEARCH_STEPS):
+        middle = 0.5 * (inside + outside)
+        inside, outside = (middle, outside) if margin(middle) >= 0.0 else (inside, middle)
+    return inside
 
 
 def _chord(margin: Callable[[float], float], low: float, high: float) -> Pair:
@@ -291,14 +286,7 @@ def _chord(margin: Callable[[float], float], low: float, high: float) -> Pair:
         a, b = (p, b) if margin(p) < margin(q) else (a, q)
     if not margin(a) >= 0.0:
         return (math.nan, math.nan)
-    ends = []
-    for outside in (2.0 * low - high, 2.0 * high - low):
-        inside = a
-        for _ in range(_SEARCH_STEPS):
-            middle = 0.5 * (inside + outside)
-            inside, outside = (middle, outside) if margin(middle) >= 0.0 else (inside, middle)
-        ends.append(inside)
-    return ends[0], ends[1]
+    return _zero(margin, a, 2.0 * low - high), _zero(margin, a, 2.0 * high - low)
 
 
 def _product(A: Rows, B: Rows) -> Rows:

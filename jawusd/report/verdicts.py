@@ -168,20 +168,13 @@ def _track(tracks: Tracks) -> Verdict:
         sigma = np.median(tracks.sigma_mm[tracked], axis=0)
     helped = np.any(tracks.status == RECOVERED, axis=1) | tracks.prior_aided
     residual = tracks.residual_px[(tracks.status != LOST) & np.isfinite(tracks.residual_px)]
+    outline = float(np.median(residual)) if residual.size else np.nan
+    uncovered = 100 * float(np.nanmean(coverage)) if np.isfinite(coverage).any() else np.nan
     checks = [
         _share("frames tracked", _mean(tracked), 0.98, 0.9, "Correct the masks of the lost frames."),
         _share("frames tracked without regularisation or a new search", _mean(~helped), 0.6, 0.3, _MASKS),
-        _below(
-            f"uncovered mask, mean (the paper: {_PAPER_COVERAGE_PERCENT} %)",
-            100 * float(np.nanmean(coverage)) if np.isfinite(coverage).any() else np.nan,
-            1.0,
-            2.0,
-            "%",
-            _MASKS,
-        ),
-        _below(
-            "outline distance, median", float(np.median(residual)) if residual.size else np.nan, 1.0, 2.0, "px", _MASKS
-        ),
+        _below(f"uncovered mask, mean (the paper: {_PAPER_COVERAGE_PERCENT} %)", uncovered, 1.0, 2.0, "%", _MASKS),
+        _below("outline distance, median", outline, 1.0, 2.0, "px", _MASKS),
         _below("expected error at the incisor (1 sigma, median)", float(sigma[0]), 0.15, 0.5, "mm", _VIEWS, 3),
         _below(
             "expected error at the worse condyle (1 sigma, median)", float(sigma[3:].max()), 0.5, 1.0, "mm", _VIEWS, 3
@@ -210,49 +203,24 @@ def _fit(data: ReportData) -> Verdict:
     table = errors.get("holdout") or errors.get("train") or {}
     kind = "poses held out of the fit" if errors.get("holdout") else "poses of the fit"
     mandible = table.get("mandible", {})
+    mean, worst = (float(mandible.get(name, np.nan)) for name in ("mean", "max"))
     out = sum(map(len, meta.get("excluded_frames", {}).values())) + len(meta.get("trimmed_frames", []))
     count = len(data.model.frames)
+    whole = f"error of {kind}, mean of the largest vertex distance (the paper, its own poses: {_PAPER_MEAN_MM} mm)"
+    single = f"error of {kind}, worst frame (the paper, its own poses: {_PAPER_WORST_MM} mm)"
     checks = [
-        _below(
-            f"error of {kind}, mean of the largest vertex distance (the paper, its own poses: {_PAPER_MEAN_MM} mm)",
-            float(mandible.get("mean", np.nan)),
-            0.6,
-            _PAPER_MEAN_MM,
-            "mm",
-            _WORST,
-        ),
-        _below(
-            f"error of {kind}, worst frame (the paper, its own poses: {_PAPER_WORST_MM} mm)",
-            float(mandible.get("max", np.nan)),
-            3.0,
-            _PAPER_WORST_MM,
-            "mm",
-            _WORST,
-        ),
+        _below(whole, mean, 0.6, _PAPER_MEAN_MM, "mm", _WORST),
+        _below(single, worst, 3.0, _PAPER_WORST_MM, "mm", _WORST),
         _share("frames used for the fit", 1 - out / count if count else np.nan, 0.9, 0.7, _WORST),
     ]
     for warning in meta.get("warnings", []):
-        if warning["code"] == "few_poses":
-            checks.append(
-                Check(
-                    "poses of the take",
-                    warning["message"],
-                    "about 30 s of all movements",
-                    LOOK,
-                    f"{_RECORD}about 30 s of all movements.",
-                )
-            )
-        elif warning["code"] not in _LACKING:
-            grade = BAD if warning["code"] in _MISTAKES else LOOK
-            checks.append(
-                Check(
-                    "human range",
-                    warning["message"],
-                    "see the table of human ranges",
-                    grade,
-                    f"Check: {warning['message']}",
-                )
-            )
+        code, message = warning["code"], warning["message"]
+        if code == "few_poses":
+            wanted = "about 30 s of all movements"
+            checks.append(Check("poses of the take", message, wanted, LOOK, f"{_RECORD}{wanted}."))
+        elif code not in _LACKING:
+            grade = BAD if code in _MISTAKES else LOOK
+            checks.append(Check("human range", message, "see the table of human ranges", grade, f"Check: {message}"))
     return _verdict("fit", checks)
 
 
@@ -272,16 +240,8 @@ def _bounds(data: ReportData) -> Verdict:
     drawn = next((one for one in synthesis if one.model == meta.get("method") and "slice" in one.quantity), None)
     if known is not None and drawn is not None and len(known.values_mm):
         ratio = float(np.median(drawn.values_mm) / max(np.median(known.values_mm), 1e-9))
-        checks.append(
-            _below(
-                "distance of random valid poses to the take, relative to that of held-out poses",
-                ratio,
-                3.0,
-                6.0,
-                "times",
-                f"{_RECORD}slow circling at every opening.",
-            )
-        )
+        name = "distance of random valid poses to the take, relative to that of held-out poses"
+        checks.append(_below(name, ratio, 3.0, 6.0, "times", f"{_RECORD}slow circling at every opening."))
     # Use the values of the experiments, so that the verdict agrees with the plot.
     warned = [w["message"] for w in meta.get("warnings", []) if w["code"] in _LACKING]
     lacks = data.experiments.coverage.sentences if data.experiments else warned
@@ -299,21 +259,10 @@ _TABLE_MM = (0.06, 0.5)
 
 def _rig(data: ReportData) -> Verdict:
     errors = [finding for finding in data.rig.findings if finding.startswith("error")]
+    grade, todo = BAD if errors else GOOD, "Correct what `jawusd validate` reports."
+    name, finer = "pose table compared with the exact model, worst vertex", "`jawusd bake --table 65`"
     checks = [
-        Check(
-            "validators",
-            f"{len(errors)} errors",
-            "no errors",
-            BAD if errors else GOOD,
-            "Correct what `jawusd validate` reports.",
-        ),
-        _below(
-            "pose table compared with the exact model, worst vertex",
-            data.rig.table_error_mm,
-            *_TABLE_MM,
-            "mm",
-            "Bake again with a finer table: `jawusd bake --table 65`.",
-            3,
-        ),
+        Check("validators", f"{len(errors)} errors", "no errors", grade, todo),
+        _below(name, data.rig.table_error_mm, *_TABLE_MM, "mm", f"Bake again with a finer table: {finer}.", 3),
     ]
     return _verdict("rig", checks)

@@ -17,7 +17,7 @@ from jawusd.evaluator.verdicts import place as place_of
 from jawusd.formats.performance import STATE_COLOURS, STATE_WORDS, SolvedJaw, SolveState
 from jawusd.formats.tracks import LOST, PARTIAL, RECOVERED, TRACKED, Tracks, uncovered_percent, worst_frames
 from jawusd.viewer.motion import Clip, KeyTrack
-from jawusd.viewer.readouts import INCISOR, border_path, captured_d, landmark_places, rest_places
+from jawusd.viewer.readouts import INCISOR, border_path, landmark_places, rest_places
 
 # Okabe and Ito's colour-blind safe palette, also used for the 3-D jaw.
 BLUE, ORANGE, GREEN, VERMILION, GREY = "#0072b2", "#e69f00", "#009e73", "#d55e00", "#888888"
@@ -62,7 +62,7 @@ def bound_plot(rig: JawRig, axis: int) -> Plot:
     corners = rig.arrays[f"polygon_{name}"]
     rings = np.split(corners, np.cumsum(rig.arrays[f"polygon_{name}_counts"])[:-1].astype(int))
     border = border_path(rig, axis)[:, [0, axis]]
-    captured = _thinned(captured_d(rig)[:, [0, axis]])
+    captured = _thinned(rig.captured_d[:, [0, axis]])
     title = ("", "laterotrusion d2 over opening d1", "protrusion d3 over opening d1")[axis]
     plot = framed(f"jaw-{name}", np.vstack([corners, border, captured]), title, "opening d1 [mm]", "mm")
     parts = [_dots(plot, captured), *(_ring(plot, ring, GREY, "4 3") for ring in rings), _ring(plot, border, BLUE)]
@@ -77,7 +77,7 @@ def posselt_plot(rig: JawRig, axis: int) -> Plot:
     origin = rest_places(rig)[INCISOR]
     columns = [0, 1] if axis == 1 else [2, 1]
     border = (landmark_places(rig, border_path(rig, axis))[:, INCISOR] - origin)[:, columns]
-    captured = (landmark_places(rig, _thinned(captured_d(rig)))[:, INCISOR] - origin)[:, columns]
+    captured = (landmark_places(rig, _thinned(rig.captured_d))[:, INCISOR] - origin)[:, columns]
     name, title, label = (
         ("jaw-frontal", "Posselt, frontal: up over left", "to the subject's left [mm]"),
         ("jaw-sagittal", "Posselt, sagittal: up over forward", "forward [mm]"),
@@ -105,10 +105,8 @@ def curve_plot(clip: Clip | None, keys: KeyTrack, span: tuple[float, float]) -> 
     plot = framed(name, corners, "parameters over frames", "frame", "mm", pad=(False, True))
     parts = []
     for axis, color in enumerate(CURVE_COLORS):
-        line = path_through(place(plot, np.stack([frames, values[:, axis]], axis=1)))
-        parts.append(f'<path d="{line}" fill="none" stroke="{color}" stroke-width="1.5"/>')
-        label = f'<text x="{_WIDTH - 70 + 24 * axis}" y="14" font-size="11" fill="{color}" font-weight="bold">'
-        parts.append(f"{label}d{axis + 1}</text>")
+        parts.append(_line(plot, frames, values[:, axis], color))
+        parts.append(_label(_WIDTH - 70 + 24 * axis, 11, f"d{axis + 1}", color))
         for key in keys:
             px, py = place(plot, np.array([[key.frame, key.d[axis]]]))[0]
             parts.append(f'<circle cx="{px:.1f}" cy="{py:.1f}" r="3" fill="{color}"/>')
@@ -209,6 +207,15 @@ def path_through(pixels: Array) -> str:
     return "M" + "L".join(f"{x:.1f} {y:.1f}" for x, y in pixels)
 
 
+def _line(plot: Plot, frames: Array, values: Array, color: str) -> str:
+    pixels = place(plot, np.stack([frames, values], axis=1))
+    return f'<path d="{path_through(pixels)}" fill="none" stroke="{color}" stroke-width="1.5"/>'
+
+
+def _label(x: float, size: int, name: str, color: str) -> str:
+    return f'<text x="{x}" y="14" font-size="{size}" fill="{color}" font-weight="bold">{name}</text>'
+
+
 def _ring(plot: Plot, points: Array, color: str, dash: str = "") -> str:
     dashed = f' stroke-dasharray="{dash}"' if dash else ""
     return f'<path d="{path_through(place(plot, points))}Z" fill="none" stroke="{color}" stroke-width="1.5"{dashed}/>'
@@ -295,10 +302,7 @@ def solve_plot(tracks: Tracks, solved: SolvedJaw, span: tuple[int, int]) -> Plot
     plot = framed("jaw-solve", corners, "solved jaw", "frame", "mm", pad=(False, True))
     parts = [_band(plot, frames, d[:, k], sigma[:, k], color) for k, color in enumerate(CURVE_COLORS)]
     for k, color in enumerate(CURVE_COLORS):
-        line = path_through(place(plot, np.stack([frames, d[:, k]], axis=1)))
-        parts.append(f'<path d="{line}" fill="none" stroke="{color}" stroke-width="1.5"/>')
-        label = f'<text x="{98 + 57 * k}" y="14" font-size="10" fill="{color}" font-weight="bold">'
-        parts.append(f"{label}{_NAMES[k]}</text>")
+        parts += [_line(plot, frames, d[:, k], color), _label(98 + 57 * k, 10, _NAMES[k], color)]
     return drawn(plot, [*parts, *(_strip(plot, tracks, solved, state) for state in SolveState)])
 
 

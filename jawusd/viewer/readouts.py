@@ -64,14 +64,9 @@ def triple(values: Array) -> tuple[float, float, float]:
     return x, y, z
 
 
-def captured_d(rig: JawRig) -> Array:
-    """Return the parameters of the captured poses stored in a rig [mm], shape (N, 3)."""
-    return rig.captured_d
-
-
 def nearest_captured(rig: JawRig, d: Array) -> Array:
     """Return captured poses near d (3,), nearest first, shape (n, 3) [mm], with n <= `GHOSTS`."""
-    captured = captured_d(rig)
+    captured = rig.captured_d
     found: list[Array] = []
     for row in captured[np.argsort(np.linalg.norm(captured - d, axis=1), kind="stable")]:
         if len(found) == GHOSTS:

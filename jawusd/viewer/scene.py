@@ -12,7 +12,7 @@ from jawusd.formats.mesh import Mesh
 from jawusd.geometry import LANDMARKS
 from jawusd.geometry.se3 import se3_inverse, transform_point, transform_points
 from jawusd.geometry.so3 import wxyz_from_matrix
-from jawusd.viewer.readouts import CONDYLES, GHOSTS, INCISOR, captured_d, habitual_path, landmark_places, rest_places
+from jawusd.viewer.readouts import CONDYLES, GHOSTS, INCISOR, habitual_path, landmark_places, rest_places
 from jawusd.viewer.viewed import MOVING, STILL, ViewedActor, is_solid
 
 Color = tuple[int, int, int]
@@ -130,7 +130,7 @@ class JawScene:
 
     def _add_paths(self, actor: ViewedActor) -> list[viser.SceneNodeHandle]:
         """Draw the paths of the incisal point and the condyles during opening, and their captured positions."""
-        d = captured_d(actor.rig)
+        d = actor.rig.captured_d
         captured = landmark_places(actor.rig, d[:: max(1, -(-len(d) // _MOST_CAPTURED))])
         path = habitual_path(actor.rig)
         handles: list[viser.SceneNodeHandle] = []
