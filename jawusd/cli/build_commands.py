@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import shlex
+from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
 import typer
 
-from jawusd.base.errors import naming_file
+from jawusd.base.errors import explain_missing_packages, naming_file
+from jawusd.base.guard import map_large_arrays
 from jawusd.cli.commands import command_line, stopped_by_signals
 from jawusd.cli.options import (
     CaptureArg,
@@ -35,14 +38,8 @@ from jawusd.cli.options import (
 from jawusd.cli.output import emit, progress, refuse_any, say
 from jawusd.formats.atomic import refuse_existing
 
-#: Trackers.
 Solver = Literal["contour", "paper"]
-
-
-#: Renderers of the paper's solver.
-Backend = Literal["cpu", "gl"]
-
-
+Backend = Literal["cpu", "gl"]  # renderers of the paper's solver
 SolverOption = Annotated[Solver, typer.Option(help="Tracker; paper, for comparison, is slower and less accurate.")]
 BackendOption = Annotated[Backend, typer.Option(help="Renderer of --solver paper; gl needs OpenGL 4.3 (EGL).")]
 
@@ -66,8 +63,7 @@ def build(
     as_json: Json = False,
 ) -> None:
     """Build a rig from a capture: calibrate if needed, sync, track, fit, track uncertain frames again, bake."""
-    from jawusd.base.guard import map_large_arrays
-    from jawusd.cli.text_build import build_lines
+    from jawusd.cli.text_build import build_lines, plan_lines
     from jawusd.pipeline import build as stages
 
     map_large_arrays()
@@ -84,12 +80,7 @@ def build(
         command=command_line(context),
     )
     if dry_run:
-        from dataclasses import asdict
-
-        from jawusd.cli.text_build import plan_lines
-        from jawusd.pipeline.build import plan_build
-
-        plan = plan_build(capture, out, options)
+        plan = stages.plan_build(capture, out, options)
         emit({"stages": [asdict(stage) for stage in plan]}, as_json, lambda: plan_lines(plan))
         return
     with progress() as report:
@@ -225,9 +216,6 @@ def demo(
 
     The default takes about 14 minutes without a GPU.
     """
-    from functools import partial
-
-    from jawusd.base.errors import explain_missing_packages
     from jawusd.cli.text_build import rounded_duration
 
     with explain_missing_packages("demo"):
@@ -271,8 +259,6 @@ def build_many(
     as_json: Json = False,
 ) -> None:
     """Build many captures, one process each; a failure does not stop the others. Exit code 1 if any failed."""
-    from dataclasses import asdict
-
     from jawusd.cli.text_build import outcome_lines
     from jawusd.formats.capture_list import load_capture_list
     from jawusd.pipeline import many

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import json
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from jawusd.base.errors import CaptureError, OutputError, SyncError, TrackingError
 from jawusd.cli.options import CaptureArg, Force, Jobs, Json, Outside
 from jawusd.cli.output import emit, plain, progress, refuse_any
-from jawusd.formats.atomic import refuse_existing
+from jawusd.formats.atomic import refuse_existing, write_text_atomic
 
 
 def init(
@@ -46,8 +48,6 @@ def init(
 
 
 def _print_reference(as_json: bool) -> None:
-    from dataclasses import asdict
-
     from jawusd.formats.capture import capture_keys
     from jawusd.formats.capture_keys import reference_lines
 
@@ -106,7 +106,6 @@ def check(capture: CaptureArg, allow_outside: Outside = False, as_json: Json = F
 
     Prints all errors and warnings at once. Exit code 0 without errors, 5 with errors.
     """
-    from jawusd.base.errors import CaptureError
     from jawusd.cli.text_capture import check_lines
     from jawusd.pipeline.check import check_capture
 
@@ -129,7 +128,6 @@ def calibrate(
 ) -> None:
     """Calibrate the cameras from clips of a chessboard or ChArUco board, and report the expected accuracy."""
     from jawusd.cli.text_capture import calibration_lines
-    from jawusd.formats.atomic import write_text_atomic
     from jawusd.pipeline.calibrate import calibrate_boards
     from jawusd.pipeline.workspace import open_capture
 
@@ -155,7 +153,6 @@ def sync(
     as_json: Json = False,
 ) -> None:
     """Estimate the frame offsets between cameras from light flashes or, without flashes, from sound."""
-    from jawusd.base.errors import SyncError
     from jawusd.cli.text_capture import sync_lines
     from jawusd.pipeline.calibrate import (
         PLOT_SUFFIXES,
@@ -241,8 +238,6 @@ def segment(
 
 def _refuse_masks(folder: Path, record: Path, force: bool) -> None:
     """Check that a folder for masks is empty, unless forced: it may contain hand-drawn masks."""
-    from jawusd.base.errors import OutputError
-
     if force or not folder.exists() or not any(folder.iterdir()):
         return
     hint = "Choose another folder, or overwrite with --force."
@@ -285,7 +280,6 @@ def plates(
     as_json: Json = False,
 ) -> None:
     """Write undistorted footage at the paths in the rig's cameras.usda, numbered by its time codes."""
-    from jawusd.base.errors import OutputError
     from jawusd.formats.tracks import load_tracks
     from jawusd.pipeline.calibrate import sync_cameras
     from jawusd.pipeline.pictures import write_plates
@@ -320,7 +314,6 @@ def photos(
     All photographs must show the same bite and be taken with one camera, whose focal length may be unknown. Some may be
     taken via an intraoral mirror. Exit code 6 if the scans do not fit the outlines.
     """
-    from jawusd.base.errors import TrackingError
     from jawusd.cli.text_capture import photograph_lines
     from jawusd.photographs.align import align_photograph_files
 

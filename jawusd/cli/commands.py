@@ -76,53 +76,55 @@ EXAMPLES = {
 }
 
 
-#: Groups of `jawusd --help`, with the summary of each command.
-GROUPS = {
+#: Groups of `jawusd --help`, with the module and the summary of each command.
+_COMMANDS = {
     "Start": {
-        "doctor": "Check the installation.",
-        "demo": "Render a synthetic capture with ground truth.",
+        "doctor": ("capture", "Check the installation."),
+        "demo": ("build", "Render a synthetic capture with ground truth."),
     },
     "Capture": {
-        "init": "Draft a capture.toml from a folder of footage and scans.",
-        "check": "Check a capture in seconds.",
-        "calibrate": "Calibrate the cameras from clips of a board.",
-        "cameras": "Convert calibrated cameras between programs.",
-        "sync": "Estimate the frame offsets between cameras.",
-        "segment": "Make masks of the teeth from the videos.",
-        "scans": "Label crown and gum of the scans.",
-        "photos": "Register two scans in occlusion from photographs.",
-        "plates": "Write undistorted footage.",
+        "init": ("capture", "Draft a capture.toml from a folder of footage and scans."),
+        "check": ("capture", "Check a capture in seconds."),
+        "calibrate": ("capture", "Calibrate the cameras from clips of a board."),
+        "cameras": ("capture", "Convert calibrated cameras between programs."),
+        "sync": ("capture", "Estimate the frame offsets between cameras."),
+        "segment": ("capture", "Make masks of the teeth from the videos."),
+        "scans": ("capture", "Label crown and gum of the scans."),
+        "photos": ("capture", "Register two scans in occlusion from photographs."),
+        "plates": ("capture", "Write undistorted footage."),
     },
     "Rig": {
-        "build": "Build a rig from a capture.",
-        "build-many": "Build many captures, one process each.",
-        "track": "Track the teeth of both jaws.",
-        "fit": "Fit a jaw model to tracks or other poses.",
-        "bake": "Write the OpenUSD rig of a model.",
-        "publish": "Copy a rig under unique names, or pack a shot.",
-        "library": "Manage many actors and compare their ranges.",
+        "build": ("build", "Build a rig from a capture."),
+        "build-many": ("build", "Build many captures, one process each."),
+        "track": ("build", "Track the teeth of both jaws."),
+        "fit": ("build", "Fit a jaw model to tracks or other poses."),
+        "bake": ("build", "Write the OpenUSD rig of a model."),
+        "publish": ("library", "Copy a rig under unique names, or pack a shot."),
+        "library": ("library", "Manage many actors and compare their ranges."),
     },
     "Animate": {
-        "animate": "Write an animation of a rig from keys, poses or ARKit.",
-        "retarget": "Retarget a motion to another subject's rig.",
-        "solve": "Track a performance of a subject with a rig.",
-        "live": "Track the jaw in live video.",
-        "rebake": "Make d and mandible of an edited stage agree.",
-        "arkit-fit": "Learn d from a subject's ARKit jaw weights.",
-        "arkit-table": "Write the jaw joint's offset per ARKit shape.",
-        "align": "Align a face model with a rig by a few points.",
-        "skin-fit": "Learn the jaw from facial skin, for closed lips.",
+        "animate": ("animate", "Write an animation of a rig from keys, poses or ARKit."),
+        "retarget": ("library", "Retarget a motion to another subject's rig."),
+        "solve": ("solve", "Track a performance of a subject with a rig."),
+        "live": ("solve", "Track the jaw in live video."),
+        "rebake": ("stage", "Make d and mandible of an edited stage agree."),
+        "arkit-fit": ("face", "Learn d from a subject's ARKit jaw weights."),
+        "arkit-table": ("animate", "Write the jaw joint's offset per ARKit shape."),
+        "align": ("face", "Align a face model with a rig by a few points."),
+        "skin-fit": ("face", "Learn the jaw from facial skin, for closed lips."),
     },
     "Inspect": {
-        "view": "View a rig or a capture in the browser.",
-        "info": "Describe a rig file or tracks.",
-        "report": "Write the report of a build or a solve again.",
-        "validate": "Check a rig, or poses against a rig.",
-        "pose": "Print the jaw pose at parameters d.",
-        "encode": "Convert poses to the nearest parameters d.",
-        "ik": "Find the d that move a point to a target.",
+        "view": ("report", "View a rig or a capture in the browser."),
+        "info": ("rig", "Describe a rig file or tracks."),
+        "report": ("report", "Write the report of a build or a solve again."),
+        "validate": ("rig", "Check a rig, or poses against a rig."),
+        "pose": ("rig", "Print the jaw pose at parameters d."),
+        "encode": ("stage", "Convert poses to the nearest parameters d."),
+        "ik": ("rig", "Find the d that move a point to a target."),
     },
 }
+GROUPS = {title: {name: words for name, (_, words) in rows.items()} for title, rows in _COMMANDS.items()}
+_MODULES = {name: module for rows in _COMMANDS.values() for name, (module, _) in rows.items()}
 SUMMARIES = {name: words for group in GROUPS.values() for name, words in group.items()}
 
 EXIT_CODES = (
@@ -288,31 +290,6 @@ def interrupted(command: str, exit_code: int = INTERRUPTED) -> NoReturn:
     raise typer.Exit(exit_code)
 
 
-_NAMES = {
-    "build_commands": ("build", "track", "fit", "bake", "demo", "build-many"),
-    "capture_commands": (
-        "init",
-        "doctor",
-        "check",
-        "calibrate",
-        "cameras",
-        "sync",
-        "segment",
-        "scans",
-        "photos",
-        "plates",
-    ),
-    "rig_commands": ("info", "pose", "validate", "ik"),
-    "stage_commands": ("encode", "rebake"),
-    "animate_commands": ("animate", "arkit-table"),
-    "face_commands": ("skin-fit", "arkit-fit", "align"),
-    "solve_commands": ("solve", "live"),
-    "library_commands": ("retarget", "library", "publish"),
-    "report_commands": ("report", "view"),
-}
-_MODULES = {name: module for module, names in _NAMES.items() for name in names}
-
-
 class Commands(TyperGroup):
     """The group of all commands; listing them does not load their modules."""
 
@@ -353,7 +330,7 @@ class _Loaded(Mapping[str, TyperCommand]):
 
 
 def _load(name: str, module: str) -> TyperCommand:
-    function = getattr(importlib.import_module(f"jawusd.cli.{module}"), name.replace("-", "_"))
+    function = getattr(importlib.import_module(f"jawusd.cli.{module}_commands"), name.replace("-", "_"))
     alone = typer.Typer(add_completion=False, rich_markup_mode=None)
     examples = "\n".join(EXAMPLES[name])
     alone.command(name, cls=Command, context_settings=CONTEXT, short_help=SUMMARIES[name], epilog=examples)(function)

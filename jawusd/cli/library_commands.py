@@ -18,7 +18,6 @@ from jawusd.formats.model import save_model
 from jawusd.library.index import PARAMETERS, Entry, Library
 from jawusd.library.personal import landmark_distance_mm
 
-#: Ways to combine the subjects of a library.
 Use = Literal["average", "closest"]
 
 

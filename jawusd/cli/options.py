@@ -15,14 +15,8 @@ if TYPE_CHECKING:
     from jawusd.pipeline.subject import Subject
 
 
-#: Forms of the jaw model.
 Method = Literal["anchored", "additive", "paper", "pca"]
-
-
-#: Length units of tables.
 LengthUnit = Literal["mm", "cm", "m"]
-
-
 USD_SUFFIXES = (".usd", ".usda", ".usdc", ".usdz")
 
 Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]

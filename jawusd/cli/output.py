@@ -10,7 +10,6 @@ import sys
 import time
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, TextIO
 
@@ -179,7 +178,7 @@ class _Copied:
         return getattr(self._stream, name)
 
 
-@contextmanager
+@contextlib.contextmanager
 def logged(path: Path, words: list[str]) -> Iterator[RunLog]:
     """Copy everything written to stdout and stderr in the context to a log file.
 

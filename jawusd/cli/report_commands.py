@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import signal
+import webbrowser
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -11,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from jawusd.base.errors import naming_file
+from jawusd.base.guard import map_large_arrays
 from jawusd.cli.options import (
     Allow,
     CaptureOption,
@@ -113,7 +115,6 @@ def _emit_experiments(found: Experiments, files: list[Path], as_json: bool) -> N
 def _report_found(
     source: Path, capture: Path | None, out: Path | None, force: bool, allow_outside: bool, as_json: bool
 ) -> None:
-    from jawusd.base.guard import map_large_arrays
     from jawusd.pipeline.report import report_build
     from jawusd.pipeline.solve_report import check_page, report_solve
 
@@ -260,8 +261,6 @@ def _interrupts_held() -> Iterator[None]:
 
 def _announce(browser: bool, url: str) -> None:
     """Print the address of a page; open it in a browser if `browser` is true."""
-    import webbrowser
-
     say(f"{url}  (Ctrl+C stops)")
     if browser:
         webbrowser.open(url)

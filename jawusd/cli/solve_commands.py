@@ -35,14 +35,8 @@ if TYPE_CHECKING:
     from jawusd.viewer.server import Viewer
 
 
-#: Motion of the head relative to the cameras.
-Head = Literal["free", "fixed"]
-
-
-#: Whether focal lengths are calibrated or estimated.
-Focal = Literal["known", "free"]
-
-
+Head = Literal["free", "fixed"]  # motion relative to the cameras
+Focal = Literal["known", "free"]  # calibrated or estimated
 ShotArg = Annotated[Path, typer.Argument(help="capture.toml of the shot, or its folder.")]
 OverlayFile = Annotated[
     Path | None, typer.Option(help="Video (.mp4) to write: the solved teeth over the images of all cameras.")
