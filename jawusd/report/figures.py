@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -90,9 +90,7 @@ def model_figure(model: JawModel) -> Figure:
     figure, axes = new_figure(11.0, 5.6, 3, 1, sharex=True, height_ratios=[1.5, 1, 1])
     shown = (("d1 opening", BLACK, "-"), ("d2 laterotrusion", BLUE, "--"), ("d3 protrusion", VERMILION, ":"))
     for index, (name, color, style) in enumerate(shown):
-        axes[0].plot(
-            *thinned(model.frames, model.d[:, index], larger_magnitude), style, color=color, lw=1.2, label=name
-        )
+        axes[0].plot(*thinned(model.frames, model.d[:, index]), style, color=color, lw=1.2, label=name)
     axes[0].set_ylabel("parameter [mm]")
     axes[1].plot(*thinned(model.frames, model.residual_mm, np.fmax), color=BLUE, lw=1, label="distance from the model")
     axes[1].axhline(rig.limits.residual_mm, color=VERMILION, lw=1, ls="--", label="limit of a valid pose")
@@ -141,24 +139,16 @@ def _mean_of_cameras(values: Array) -> Array:
         return np.nanmean(values, axis=2)
 
 
-def larger_magnitude(a: Array, b: Array) -> Array:
-    """Return, for each element, the value with the larger magnitude, ignoring NaN."""
-    return np.where(np.isnan(a) | (np.abs(b) > np.abs(a)), b, a)
-
-
-def thinned(frames: NDArray[np.int64], values: Array, keep: Callable[[Array, Array], Array]) -> tuple[Array, Array]:
-    """Return at most `_COLUMNS` points (frames, values); `keep` reduces each group of frames to one."""
+def thinned(frames: NDArray[np.int64], values: Array, keep: np.ufunc | None = None) -> tuple[Array, Array]:
+    """Return at most `_COLUMNS` points (frames, values); of several frames, the largest magnitude, or by `keep`."""
     step = -(-len(frames) // _COLUMNS)
     if step <= 1:
         return frames.astype(np.float64), values
     starts = np.arange(0, len(frames), step)
-    chosen = values[starts]
-    for offset in range(1, step):
-        later = np.full(len(starts), np.nan)
-        inside = starts + offset < len(values)
-        later[inside] = values[starts[inside] + offset]
-        chosen = keep(chosen, later)
-    return frames[starts].astype(np.float64), chosen
+    if keep is None:
+        low, high = np.fmin.reduceat(values, starts), np.fmax.reduceat(values, starts)
+        return frames[starts].astype(np.float64), np.where(-low > high, low, high)
+    return frames[starts].astype(np.float64), keep.reduceat(values, starts)
 
 
 def legend_beside(axis: Axes) -> None:

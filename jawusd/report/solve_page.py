@@ -19,7 +19,7 @@ from jawusd.formats.finding import Finding
 from jawusd.formats.performance import STATE_WORDS, SolvedJaw, SolveState
 from jawusd.formats.report import SolveReportData
 from jawusd.formats.tracks import LOST, Tracks
-from jawusd.report.figures import larger_magnitude, legend_beside, name_lanes, runs, thinned
+from jawusd.report.figures import legend_beside, name_lanes, runs, thinned
 from jawusd.report.style import BLACK, BLUE, GREEN, GREY, MAGENTA, ORANGE, SKY, VERMILION, inline_svg, new_figure
 from jawusd.report.templates import base64_text, package_file, page_environment
 
@@ -41,7 +41,7 @@ def jaw_figure(tracks: Tracks, solved: SolvedJaw, fps: float) -> Figure:
         at, low = thinned(frames, value - _BAND * sigma, np.fmin)
         high = thinned(frames, value + _BAND * sigma, np.fmax)[1]
         axis.fill_between(at, low, high, color=ink, alpha=0.25, linewidth=0, label="95 % (2 sigma)")
-        axis.plot(*thinned(frames, value, larger_magnitude), color=ink, lw=1.2, label="solved")
+        axis.plot(*thinned(frames, value), color=ink, lw=1.2, label="solved")
         axis.set_ylabel(f"{name} [mm]")
     for name, ink, style, sigma in zip(("d1", "d2", "d3"), _INKS, _STYLES, solved.sigma_mm.T, strict=True):
         axes[3].plot(*thinned(frames, np.maximum(sigma, 1e-4), np.fmax), style, color=ink, lw=1.1, label=name)
