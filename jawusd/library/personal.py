@@ -1,12 +1,8 @@
 """Motion for a subject without a capture: the motion of the library's subjects, transferred and averaged.
 
-Motion is transferred through the five landmarks. The displacement of each landmark is scaled laterally by the ratio of
-the two subjects' intercondylar distances, and in the sagittal plane by the ratio of the distances between condyles and
-incisal point. The resulting pose is the rigid motion that best fits the displaced landmarks.
-
-The weight of a library subject decreases with the distance between its landmarks and those of the target subject. The
-bandwidth of the weights and the expected error come from leave-one-out validation: each subject of the library is
-predicted from the other subjects.
+The displacement of each of the five landmarks is scaled laterally by the ratio of the two subjects' intercondylar
+distances, and in the sagittal plane by that of their distances between condyles and incisal point. The bandwidth of the
+weights, which decrease with the distance between landmarks, and the expected error come from leave-one-out validation.
 """
 
 from __future__ import annotations

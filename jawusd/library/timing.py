@@ -1,11 +1,9 @@
 """Preserve the timing of a retargeted curve, so that it rises and falls where the original curve does.
 
-Ranges depend on the opening, so a curve retargeted by fractions of the ranges may peak some frames before or after the
-original. The result is the least-squares nearest curve that moves in the same direction as the original between any two
-samples: isotonic regression (Barlow et al. 1972) whose direction follows the sign of the original's steps. The problem
-is solved exactly by dynamic programming, whose state is the cost of all samples so far as a function of the last value.
-The derivative of this cost is piecewise linear and increasing, and each step truncates one of its ends, as in R.
-Tibshirani, H. Hoefling, R. Tibshirani, Nearly-Isotonic Regression, Technometrics 53 (2011).
+The result is the least-squares nearest curve that moves in the same direction as the original between any two samples:
+isotonic regression (Barlow et al. 1972) whose direction follows the original's steps. It is found by dynamic
+programming over the derivative of the cost as a function of the last value, as in R. Tibshirani, H. Hoefling,
+R. Tibshirani, Nearly-Isotonic Regression, Technometrics 53 (2011).
 """
 
 from __future__ import annotations

@@ -87,9 +87,8 @@ def _is_consistent(mesh: Mesh) -> bool:
 class PaperEnergy:
     """Energy of poses of one arch.
 
-    Every view is rendered into a separate screen buffer around the teeth, undistorted and at the working resolution.
-    There is no depth buffer; a pixel counts as red or green if any triangle of this colour covers its centre. With
-    back-face culling, the counts differ by about ten pixels from counts with a depth buffer.
+    Every view is rendered into a screen buffer around the teeth, without a depth buffer: a pixel counts as red or green
+    if any triangle of this colour covers its centre. With back-face culling, the counts differ by about ten pixels.
     """
 
     def __init__(self, counter: PixelCounter, scan: PaperScan, boundary_weight: float) -> None:

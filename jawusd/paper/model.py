@@ -6,10 +6,9 @@ Phi2 and Phi3; and
 
     Phi(d) = Phi1(d1) + Phi2(d2) + Phi3(d3)                                                       (paper eq. 5)
 
-Taken literally, the sum contains Phi_gen(0) three times; here, Phi_gen(0) is contained once. The motion that a
-component represents varies between trainings. Therefore, components are grouped by the motion of the incisal point
-unless the paper's fixed groups are requested. Twists are expressed in mandible-metric coordinates, which makes the
-result independent of units and origin.
+Taken literally, the sum contains Phi_gen(0) three times; here, it is contained once. What a component represents varies
+between trainings, so components are grouped by the motion of the incisal point unless the paper's fixed groups are
+requested. Twists are in mandible-metric coordinates, which makes the result independent of units and origin.
 """
 
 from __future__ import annotations
@@ -119,7 +118,6 @@ def fit_paper(
         shown: parameters that the data excite, shape (3,).
         literal: whether to keep the paper's groups (1), (2, 3), (4, 5), whichever motion the components describe.
         starts: number of random initialisations; the sum with the smallest training error is kept.
-        seed: seed of the first initialisation.
         nets: cache of trained networks with five components, by seed, updated in place.
 
     Raises:

@@ -138,8 +138,7 @@ def pose_data(page: PosePage) -> dict[str, object]:
     """Return the input of pose.js, ready for JSON encoding.
 
     The table contains, for each grid point, the twist (omega [rad], v [mm]) of the motion relative to occlusion in the
-    anatomical frame, and the margin [mm]. The take contains d and the margin of every frame [mm]; the ghosts contain d
-    of captured poses [mm].
+    anatomical frame, and the margin [mm]; the take d and the margin of every frame [mm]; the ghosts d [mm].
     """
     rig = page.rig
     d = np.stack(np.meshgrid(*page.axes, indexing="ij"), axis=-1).reshape(-1, 3)

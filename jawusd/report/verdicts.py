@@ -90,8 +90,8 @@ def judge(data: ReportData) -> list[Verdict]:
 def summary(verdicts: Sequence[Verdict]) -> BuildVerdict:
     """Return the worst grade, advice on what to do, and the checks with that grade and their limits.
 
-    The advice is ordered by grade, then by stage, since a fault affects the stages after it. The
-    movements to record are listed in one sentence.
+    Advice is ordered by grade, then by stage, since a fault affects the stages after it; movements to record share a
+    sentence.
     """
     grade = _worst([verdict.grade for verdict in verdicts])
     checks = [(verdict.stage, check) for verdict in verdicts for check in verdict.checks]

@@ -30,7 +30,6 @@ def encoded(chart: Chart, vectors: Tensor, target: Tensor, u: Tensor) -> tuple[T
     to first order; one step ``x2 = x1 - H grad(x1, target)`` makes it correct to second order.
 
     Args:
-        chart: The model.
         vectors: Homogeneous vectors (4, m), anatomical frame [mm].
         target: Target positions [mm], shape (n, 3, m).
         u: Displacements (n, 3) [mm] of the incisal point, where the search starts.

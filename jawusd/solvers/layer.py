@@ -56,9 +56,7 @@ class TemporalPrior(nn.Module):
     """A prior on motion: squared Mahalanobis norms of velocity and acceleration of d, zero for a jaw at rest.
 
     Both are modelled as normally distributed with mean zero; the inverses of their covariances are buffers, float64.
-
-    Args:
-        speeds: Statistics of the jaw's motion: `JawRig.speeds`, or `Speeds.of_take`.
+    `JawRig.speeds` or `Speeds.of_take` give the statistics.
     """
 
     velocity: Tensor
@@ -99,16 +97,10 @@ class JawLayer(nn.Module):
     `torch.func`, `torch.compile(fullgraph=True)`, `torch.export` and its ONNX exporter, for any batch shape.
 
     `encode` and `loss` have first and second derivatives; `residuals`, `project` and `inside` have only first
-    derivatives.
+    derivatives. `temporal` is None if the rig has no speeds.
 
     All functions compute in the precision of the layer: autocast and TensorFloat-32 are off within them. A captured
     graph, however, uses the matrix multiplication precision that the surrounding program has set.
-
-    ``layer.temporal(d, fps)`` is a prior on motion between frames (see `TemporalPrior`); None if the rig has no
-    speeds.
-
-    Args:
-        rig: The rig.
 
     Raises:
         EvaluatorError: the bound of the rig is empty or not connected.
@@ -204,17 +196,11 @@ class JawLayer(nn.Module):
 
     @full_precision
     def encode(self, T_skull_mandible: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the nearest jaw parameters and their landmark distance, as `JawRig.encode` does.
+        """Return the nearest d (..., 3) [mm] and residual_mm (...) of poses (..., 4, 4), as `JawRig.encode` does.
 
         First and second derivatives with respect to the pose are exact, from the implicit function theorem on
-        ``grad_d |pose(d) - T|^2 = 0``, including second derivatives of the model.
-
-        Args:
-            T_skull_mandible: Poses, shape (..., 4, 4).
-
-        Returns:
-            d [mm], shape (..., 3), and residual_mm, shape (...). The distance has a kink at zero, where
-            its gradient is set to zero.
+        ``grad_d |pose(d) - T|^2 = 0``, including second derivatives of the model. The distance has a kink at zero,
+        where its gradient is set to zero.
         """
         d, residuals = self._encode(T_skull_mandible)
         squared = residuals.square().sum(dim=-1)

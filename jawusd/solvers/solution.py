@@ -1,12 +1,10 @@
 """Shared by all modules of this package: full precision, and iterative searches as differentiable functions.
 
-Functions compute in float32 or float64, regardless of autocast and matrix multiplication settings: points are hundreds
-of millimetres from the origin, where bfloat16 resolves only 1 mm, and TensorFloat-32 0.1 mm.
+Points are hundreds of millimetres from the origin, where bfloat16 resolves only 1 mm, and TensorFloat-32 0.1 mm.
 
-Autograd does not trace a search; its derivatives are attached to the results. A search takes rows (n, ...) and returns
-tensors whose first axis is n. In eager mode a search may stop early, depending on values; while a graph is captured it
-takes a fixed number of steps. Derivatives come from the implicit function theorem (see `attached`); there are no second
-derivatives.
+Autograd does not trace a search, which takes rows (n, ...) and returns tensors whose first axis is n; derivatives from
+the implicit function theorem are attached to its results. While a graph is captured, a search takes a fixed number of
+steps.
 """
 
 from __future__ import annotations

@@ -32,10 +32,8 @@ _SPACE_SIDE = (0.9, -0.7, 0.0)  # offset of the 3-D view's direction from that o
 class CapturePage:
     """Connect a page's widgets with a capture.
 
-    Attributes:
-        layout: layout of the current image; None before the first one.
-        poses: T_page_scan (4, 4) of the displayed scans, by arch.
-        drawn: number of the redraw request that was drawn last.
+    `layout` is that of the current image, None before the first one; `poses` are T_page_scan (4, 4) of the displayed
+    scans, by arch; `drawn` is the number of the redraw request that was drawn last.
     """
 
     def __init__(self, client: viser.ClientHandle, capture: ViewedCapture) -> None:

@@ -41,12 +41,10 @@ class PickDraft:
 
 
 class PickBook:
-    """The picks of one frame.
+    """The picks of one frame, in the order they were made.
 
-    Attributes:
-        picks: the picks in the order they were made.
-        frame: frame of the reference camera to which all pixels belong; None before the first pixel.
-        selected: index of the pick whose pixel is set by the next click; None without picks.
+    `frame` is the frame of the reference camera to which all pixels belong, None before the first pixel. The next click
+    sets a pixel of the pick with the index `selected`, None without picks.
     """
 
     def __init__(self, given: Bootstrap | None = None) -> None:

@@ -82,9 +82,8 @@ class Session:
     def limits(self) -> Array:
         """Return the lower and upper limit of each parameter [mm], shape (3, 2).
 
-        The limits of d1 are its full range. The limits of d2 are those of valid poses at the current d1 and d3, and the
-        limits of d3 those at the current d1 and d2. If there are no valid poses, the other parameter is taken as 0; if
-        there are still none, both limits are the current value.
+        Those of d1 are its full range; those of d2 and d3 enclose valid poses with the other parameters as they are, or
+        with the other one of d2 and d3 at 0. If there are none, both limits are the current value.
         """
         d = self.d
         found, alone = np.moveaxis(np.reshape(self.rig.ranges(d[0], [d[1], 0.0], [d[2], 0.0]), (2, 2, 2)), 2, 0)
@@ -95,8 +94,7 @@ class Session:
     def set_parameter(self, index: int, value: float) -> None:
         """Set d1, d2 or d3 (index 0 .. 2) [mm] from a slider; successive moves of one slider are a single undo step.
 
-        With `keep_valid`, d2 and d3 are scaled down until the pose is valid if the opening changes; changes of d2 and
-        d3 stop at the bound.
+        With `keep_valid`, a change of the opening scales d2 and d3 down; changes of d2 and d3 stop at the bound.
 
         Raises:
             ValueError: the value is not finite.
@@ -153,9 +151,9 @@ class Session:
 
         Args:
             p_skull: Point under the pointer [mm], skull frame, shape (3,).
-            sight: Viewing direction, skull frame, shape (3,): the grabbed point moves to the line through p_skull in
-                this direction, and its depth follows the subject's habitual path. If None, or if the view is from above
-                or below, so that its depth is the opening, the point moves to p_skull itself.
+            sight: Viewing direction, skull frame, shape (3,): the point moves to the line through p_skull in this
+                direction, and its depth follows the habitual path. If None, or if the view is from above or below, so
+                that its depth is the opening, the point moves to p_skull itself.
 
         Returns:
             The target that the grabbed point was moved towards [mm], skull frame, shape (3,).

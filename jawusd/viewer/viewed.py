@@ -113,8 +113,7 @@ def for_view(mesh: Mesh, most_faces: int) -> Mesh:
     """Return a mesh decimated to at most `most_faces` faces for display; leave smaller meshes unchanged.
 
     The method is vertex clustering (Rossignac and Borrel, "Multi-resolution 3D approximations for rendering complex
-    scenes", 1993). The next cell size assumes that the number of faces is inversely proportional to the square of the
-    cell size.
+    scenes", 1993). The number of faces is about inversely proportional to the square of the cell size.
     """
     if len(mesh.faces) <= most_faces:
         return mesh

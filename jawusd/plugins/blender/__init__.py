@@ -1,7 +1,4 @@
-"""Blender add-on for jaw rigs imported from USD: sliders, keys, handles, cameras, and export back to USD.
-
-`python -m jawusd.plugins FILE.zip` builds the extension, which includes the modules of jawusd that it needs.
-"""
+"""Blender add-on for jaw rigs imported from USD: sliders, keys, handles, cameras, and export back to USD."""
 
 from __future__ import annotations
 
