@@ -298,20 +298,15 @@ def counted(
     frames: Array | NDArray[np.int64], verdicts: Verdicts
 ) -> tuple[list[dict[str, object]], dict[str, int | float], str]:
     """Return the verdicts on frames (F,) as rows for JSON, and their counts for JSON and in words."""
-    rows = _verdict_rows(frames, verdicts)
+    figures = (frames, verdicts.valid, verdicts.words(), verdicts.residual_mm, verdicts.margin_mm)
+    rows: list[dict[str, object]] = [
+        {"frame": int(frame), "valid": bool(ok), "reason": words, "residual_mm": float(res), "margin_mm": float(margin)}
+        for frame, ok, words, res, margin in zip(*figures, strict=True)
+    ]
     inside, valid = int((verdicts.valid & verdicts.inside()).sum()), int(verdicts.valid.sum())
     counts = {"inside": inside, "within_tolerance": valid - inside, "invalid": len(rows) - valid}
     words = f"{inside} inside, {valid - inside} within tolerance, {len(rows) - valid} invalid"
     return rows, {**counts, "tolerance_mm": verdicts.tolerance_mm}, words
-
-
-def _verdict_rows(frames: Array | NDArray[np.int64], verdicts: Verdicts) -> list[dict[str, object]]:
-    return [
-        {"frame": int(frame), "valid": bool(ok), "reason": words, "residual_mm": float(res), "margin_mm": float(margin)}
-        for frame, ok, words, res, margin in zip(
-            frames, verdicts.valid, verdicts.words(), verdicts.residual_mm, verdicts.margin_mm, strict=True
-        )
-    ]
 
 
 def verdict_lines(rows: Sequence[Mapping[str, object]]) -> list[str]:

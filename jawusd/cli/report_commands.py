@@ -170,7 +170,11 @@ def view(
     allow: Allow = None,
 ) -> None:
     """View and animate a rig in the browser; or view the footage of a capture, to inspect poses and set picks."""
-    capture = _is_capture(rig)
+    capture = False
+    if rig is not None:
+        from jawusd.pipeline.view import is_capture
+
+        capture = is_capture(rig)
     if tracks is not None and not capture:
         raise typer.BadParameter("--tracks needs a capture, not a rig.")
     if prim is not None and capture:
@@ -194,14 +198,6 @@ def view(
         _serve_capture(rig, tracks, host, port, browser, allow_outside)
     else:
         _serve_rig(rig, host, port, prim, browser, play)
-
-
-def _is_capture(rig: Path | None) -> bool:
-    if rig is None:
-        return False
-    from jawusd.pipeline.view import is_capture
-
-    return is_capture(rig)
 
 
 def _name_changed_files(folder: Path) -> None:

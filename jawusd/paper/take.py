@@ -69,7 +69,8 @@ def track_capture_paper(
     table = {camera.name: camera for camera in cameras}
     scans = (paper_scan(upper, "upper"), paper_scan(lower, "lower"))
     bootstrap = _picks(capture)
-    start = _start_poses(bootstrap, table, (upper, lower))
+    parts = zip((bootstrap.upper, bootstrap.lower), (upper, lower), ARCH_NAMES, strict=True)
+    start = np.stack([pose_from_picks(picks, mesh.vertices, table, name)[0] for picks, mesh, name in parts])
     centre = np.mean([transform_point(start[r], scans[r].centre) for r in ARCHES], axis=0)
     with ExitStack() as stack:
         masks = stack.enter_context(MaskViews(capture.cameras, table, offsets, centre, config.working_px_per_mm))
@@ -110,12 +111,6 @@ def _picks(capture: Capture) -> Bootstrap:
             hint="Add at least three picks per arch, each seen by two cameras.",
         )
     return capture.bootstrap
-
-
-def _start_poses(bootstrap: Bootstrap, cameras: Mapping[str, Camera], meshes: tuple[Mesh, Mesh]) -> Array:
-    """Return T_world_upper and T_world_lower from the picks, shape (2, 4, 4)."""
-    picks = (bootstrap.upper, bootstrap.lower)
-    return np.stack([pose_from_picks(picks[r], meshes[r].vertices, cameras, ARCH_NAMES[r])[0] for r in ARCHES])
 
 
 def _energies(

@@ -71,13 +71,8 @@ def _field(grid: DistanceGrid, up: int, closed_mm: float) -> dict[str, object]:
         "shape": list(values.shape),
         "low": low,
         "unit": _STEP_MM,
-        "values": _deflated(_steps(values, low, high)),
+        "values": _deflated(np.round((np.clip(values, low, high) - low) / _STEP_MM).astype(np.uint8)),
     }
-
-
-def _steps(values: NDArray[np.float32], low: float, high: float) -> NDArray[np.uint8]:
-    """Return values clipped to a range, as numbers of `_STEP_MM` above its lower end."""
-    return np.round((np.clip(values, low, high) - low) / _STEP_MM).astype(np.uint8)
 
 
 def _deflated(values: NDArray[np.uint8] | NDArray[np.int16]) -> str:

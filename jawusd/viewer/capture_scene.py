@@ -48,8 +48,8 @@ class CaptureScene:
         self._frustums = {name: self._add_frustum(name) for name in capture.sizes_px if name in capture.cameras}
         self._arches = {arch: scene.add_frame(f"/{arch}", show_axes=False, visible=False) for arch in ARCHES}
         self._parts: dict[str, viser.MeshHandle] = {}
-        for arch in ARCHES:
-            self._add_scan(arch)
+        for arch, crowns in capture.crowns.items():
+            self._add_parts(arch, (("teeth", crowns, ENAMEL), ("gum", ~crowns, GUM)), _MOST_FACES)
         self._marks: list[viser.SceneNodeHandle] = []
 
     def _add_frustum(self, name: str) -> viser.CameraFrustumHandle:
@@ -72,10 +72,6 @@ class CaptureScene:
         )
         self._scene.add_label(f"/space/{name}/name", name, anchor="bottom-center")
         return frustum
-
-    def _add_scan(self, arch: str) -> None:
-        crowns = self._capture.crowns[arch]
-        self._add_parts(arch, (("teeth", crowns, ENAMEL), ("gum", ~crowns, GUM)), _MOST_FACES)
 
     def show_labels(self, arch: str, crown: Mask, gum: Mask, base: Mask) -> None:
         """Redraw a scan with the given crown, gum and base faces, masks of shape (F,)."""

@@ -103,19 +103,15 @@ class JawScene:
 
     def add_marks(self, actor: ViewedActor) -> None:
         """Add the landmarks, the paths, and the hidden marks of pins and of the grabbed point."""
-        self._add_landmarks(actor.rig.landmarks)
+        for name, place in zip(LANDMARKS, actor.rig.landmarks, strict=True):
+            if not name.startswith("molar"):
+                self._ball(f"/jaw/{name}", _MARKER_MM, _CONDYLE if name.startswith("condyle") else _INCISOR, place)
         self._paths = self._add_paths(actor)
         self._pins = {name: self._ball(f"/pin/{name}", _PIN_MM, _PIN, opacity=0.6) for name in LANDMARKS}
         self._held = self._ball("/held", _MARKER_MM, _HELD)
         self._line = self._lines("/pull", np.zeros((1, 2, 3)), _HELD)
         self.show_grab(None, None)
         self.show_pins({})
-
-    def _add_landmarks(self, landmarks: Array) -> None:
-        for name, place in zip(LANDMARKS, landmarks, strict=True):
-            color = _CONDYLE if name.startswith("condyle") else _INCISOR
-            if not name.startswith("molar"):
-                self._ball(f"/jaw/{name}", _MARKER_MM, color, place)
 
     def _ball(
         self, name: str, radius_mm: float, color: Color, place: Array | None = None, opacity: float | None = None

@@ -44,7 +44,8 @@ def link_rigs(stage: Usd.Stage, prim_map: PrimMap) -> bool:
 
     prims = vendored_usd.rig_prims(stage)
     for prim in prims:
-        actor, mandible = (_object_of(prim_map, path) for path in (prim.GetPath(), _mandible_path(prim)))
+        moving = prim.GetRelationship("jaw:mandible").GetTargets()[0]
+        actor, mandible = (_object_of(prim_map, path) for path in (prim.GetPath(), moving))
         if actor is None or mandible is None:
             _note_missing_sliders(prim, _nearest_object(prim_map, prim.GetPath()))
             continue
@@ -60,10 +61,6 @@ def link_rigs(stage: Usd.Stage, prim_map: PrimMap) -> bool:
         drive(mandible, actor)
         _key(actor, prim)
     return bool(prims)
-
-
-def _mandible_path(prim: Usd.Prim) -> Sdf.Path:
-    return prim.GetRelationship("jaw:mandible").GetTargets()[0]
 
 
 def _note_missing_sliders(prim: Usd.Prim, nearest: bpy.types.Object | None) -> None:
