@@ -7,7 +7,7 @@ itself. Derivatives are spatial, S (n, 6, 3) with ``M(x + e) = exp(S e) M(x)``; 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Protocol, cast
+from typing import cast
 
 import torch
 from torch import Tensor
@@ -53,22 +53,6 @@ def _curve(module: MotionModule, name: str, x: Tensor) -> tuple[Tensor, Tensor]:
 
 
 TENSORS: Elementary[Tensor] = Elementary(torch.sqrt, torch.exp, OPERATIONS.clip, _glide)
-
-
-class Chart(Protocol):
-    """Interface through which the search for the nearest pose uses a model."""
-
-    def start(self, u: Tensor) -> Tensor:
-        """Return starting points x (n, 3) for displacements u (n, 3) [mm] of the incisal point."""
-
-    def derivative(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return rotation (n, 3, 3), translation (n, 3) [mm] and derivative S (n, 6, 3) at chart coordinates x."""
-
-    def decoded(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Return d (n, 3) [mm] at chart coordinates x, and dd/dx (n, 3, 3)."""
-
-    def attached(self, d: Tensor, by_x: Tensor, x: Tensor) -> Tensor:
-        """Return the d of `decoded` with first and second derivatives with respect to the chart coordinates x."""
 
 
 class AnchoredMotion(MotionModule):
@@ -198,7 +182,11 @@ class AdditiveMotion(DirectMotion):
         return _twist_derivative(sum(values), torch.stack(slopes, dim=2))
 
 
-def chart_of(kind: str, arrays: Mapping[str, Array]) -> AnchoredMotion | DirectMotion:
+#: A model as the search for its nearest pose uses it.
+Chart = AnchoredMotion | DirectMotion
+
+
+def chart_of(kind: str, arrays: Mapping[str, Array]) -> Chart:
     """Return the chart of a model of the given kind."""
     if kind == ANCHORED:
         return AnchoredMotion(arrays)
