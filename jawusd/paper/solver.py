@@ -8,9 +8,10 @@ from itertools import product
 from math import radians
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from jawusd.base.arrays import Array
-from jawusd.geometry import orthonormalise, transform_point
+from jawusd.geometry import make_transform, orthonormalise, transform_point
 
 _GOLDEN = (np.sqrt(5) - 1) / 2
 
@@ -131,18 +132,7 @@ def golden_section(line: Line, reach: float, tolerance: float) -> tuple[float, f
 
 def _poses(start: Array, centre: Array, parameters: Array) -> Array:
     """Return T_world_scan for angles and translations (N, 6) relative to the start, shape (N, 4, 4)."""
-    cx, cy, cz = np.cos(parameters[:, :3]).T
-    sx, sy, sz = np.sin(parameters[:, :3]).T
-    R = np.array(
-        [
-            [cz * cy, cz * sy * sx - sz * cx, cz * sy * cx + sz * sx],
-            [sz * cy, sz * sy * sx + cz * cx, sz * sy * cx - cz * sx],
-            [-sy, cy * sx, cy * cx],
-        ]
-    ).transpose(2, 0, 1)
+    R = Rotation.from_euler("ZYX", parameters[:, 2::-1]).as_matrix()
     pivot = transform_point(start, centre)
-    out = np.zeros((len(parameters), 4, 4))
-    out[:, :3, :3] = R @ start[:3, :3]
-    out[:, :3, 3] = R @ (start[:3, 3] - pivot) + pivot + parameters[:, 3:]
-    out[:, 3, 3] = 1
-    return orthonormalise(out)
+    moved = R @ (start[:3, 3] - pivot) + pivot + parameters[:, 3:]
+    return orthonormalise(make_transform(R @ start[:3, :3], moved))
