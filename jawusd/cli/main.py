@@ -60,9 +60,8 @@ _verbose = False
 
 def main() -> None:
     """Run the command line and exit: 0 success, 1 negative result, 2 wrong usage, 3 and above by error family."""
-    if (
-        "PXR_WORK_THREAD_LIMIT" not in os.environ
-    ):  # OpenUSD reads this variable when loaded; rigs are too small to gain from threads
+    # OpenUSD reads this variable when loaded; rigs are too small to gain from threads.
+    if "PXR_WORK_THREAD_LIMIT" not in os.environ:
         os.environ |= {"PXR_WORK_THREAD_LIMIT": "1", "TF_ENV_SETTING_ALERTS_ENABLED": "0"}
     # Numpy reads the number of threads when it is loaded. Multi-threaded sums differ in their last bits between
     # machines, which changes fits by micrometres. The matrices are too small to gain from threads.

@@ -279,9 +279,8 @@ def _write_baked(
 
     first = taken[0]
     motion = first.motion
-    if (
-        first.found.fitted and prim is not None and shot.suffix.lower() not in USD_SUFFIXES
-    ):  # in the other branches, `prim` is a path in the shot
+    if first.found.fitted and prim is not None and shot.suffix.lower() not in USD_SUFFIXES:
+        # in the other branches, `prim` is a path in the shot
         write_over(out, rig, first.rig, motion.frames, motion.d, first.found.fps, prim)
     elif first.found.fitted:
         write_animation(out, rig, motion.frames, motion.d, first.found.fps, rig=first.rig)

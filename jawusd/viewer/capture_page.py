@@ -152,10 +152,8 @@ class CapturePage:
         elif self.layout is not None:
             seen.append(self.layout.corners())
         points = np.vstack(seen)
-        if aspect < PHONE:
-            points = np.vstack(
-                [points, points - np.ptp(points @ UP) * np.array(UP)]
-            )  # on a phone, the panel covers the lower half
+        if aspect < PHONE:  # on a phone, the panel covers the lower half
+            points = np.vstack([points, points - np.ptp(points @ UP) * np.array(UP)])
         self.scene.look(*fit_view(points, away, UP, aspect))
 
     def _poses_at(self, frame: int) -> tuple[Array, Array] | None:
