@@ -12,7 +12,6 @@ import jawusd
 from jawusd.base.errors import FormatError
 from jawusd.cli.motion import (
     AuthoredMotion,
-    Changes,
     carried_over,
     emit_motion,
     follow_curves,
@@ -51,14 +50,6 @@ def _source_motion(loaded: JawRig, rig: Path, source: Path, prim: str | None) ->
     own = None if source.suffix.lower() in USD_SUFFIXES else prim  # the rig's prim path in the stage may differ
     found = read_stage_motion(loaded, rig, source, own, None, None, None)
     return AuthoredMotion(found.frames, found.d, found.fps)
-
-
-def _kept(loaded: JawRig, source: Path | None, motion: AuthoredMotion) -> tuple[AuthoredMotion, Changes]:
-    """Return the motion moved inside the bound, and the changes; warn if a stage, FBX or glTF has no motion."""
-    kept, changes = kept_inside(loaded, motion)
-    if source is not None and holds_stage(source):
-        changes.lines.extend(still_lines(moved_mm(loaded, motion.d), len(motion.d)))
-    return kept, changes
 
 
 def _refuse_conflicts(
@@ -157,7 +148,10 @@ def animate(
     if resample is not None:
         motion, rate = resampled(loaded, motion, rate, resample), resample
     if retarget_from is None:
-        motion, changes = _kept(loaded, source, motion)
+        given = motion.d
+        motion, changes = kept_inside(loaded, motion)
+        if source is not None and holds_stage(source):
+            changes.lines.extend(still_lines(moved_mm(loaded, given), len(given)))
     motion, said = _write(out, rig, loaded, motion, rate, prim, splines)
     changes.lines.extend(said)
     emit_motion(out, rate, motion, changes, as_json)

@@ -63,26 +63,22 @@ def read_motion(rig: JawRig, source: Path) -> AuthoredMotion:
         FormatError: the file is invalid.
     """
     with naming_file(source):
-        return _read_motion(rig, source)
-
-
-def _read_motion(rig: JawRig, source: Path) -> AuthoredMotion:
-    check_input(source)
-    if source.suffix.lower() == ".npz":
-        raise FormatError(
-            "is an npz file; expected key frames, or a table of d values or poses.",
-            hint="`jawusd encode` writes the d values of tracks as a table.",
-        )
-    if source.suffix.lower() == ".json" and source.is_file() and source.read_bytes().lstrip()[:1] == b"{":
-        keys = load_keys(source)
-        key_frames, _ = keys.arrays()
-        at = np.unique(np.concatenate([np.arange(np.ceil(key_frames[0]), np.floor(key_frames[-1]) + 1), key_frames]))
-        d = curve_at(rig, keys, at)
-        return AuthoredMotion(at, d, keys.fps, keys)
-    frames, d = read_poses_or_parameters(source)
-    if d.ndim > 2:
-        d, _ = rig.encode(d)
-    return AuthoredMotion(frames.astype(np.float64), d, None)
+        check_input(source)
+        if source.suffix.lower() == ".npz":
+            raise FormatError(
+                "is an npz file; expected key frames, or a table of d values or poses.",
+                hint="`jawusd encode` writes the d values of tracks as a table.",
+            )
+        if source.suffix.lower() == ".json" and source.is_file() and source.read_bytes().lstrip()[:1] == b"{":
+            keys = load_keys(source)
+            key_frames, _ = keys.arrays()
+            at = np.union1d(np.arange(np.ceil(key_frames[0]), np.floor(key_frames[-1]) + 1), key_frames)
+            d = curve_at(rig, keys, at)
+            return AuthoredMotion(at, d, keys.fps, keys)
+        frames, d = read_poses_or_parameters(source)
+        if d.ndim > 2:
+            d, _ = rig.encode(d)
+        return AuthoredMotion(frames.astype(np.float64), d, None)
 
 
 def curve_at(rig: JawRig, keys: Keys, at: Array) -> Array:
