@@ -33,8 +33,8 @@ _COUNTS = types.Array(types.int64, 2, "C")
 class PixelCounter(Protocol):
     """Protocol of renderers that count the pixels of a scan: `RasterCounter` and `paper.gl.GlCounter`."""
 
-    def show(self, matrices: Array, masks: Mask, free: Mask) -> None:
-        """Set the masks of one frame: matrices (C, 3, 4), masks and free (C, h, w)."""
+    def show(self, matrices: Array, masks: Mask) -> None:
+        """Set the masks (C, h, w) of one frame, and the matrices (C, 3, 4) of their views."""
 
     def counts(self, poses: Array) -> NDArray[np.int64]:
         """Return E_SP and E_BND of poses (N, 4, 4) in every view, shape (N, C, 2)."""
@@ -89,6 +89,7 @@ class PaperEnergy:
 
     Every view is rendered into a screen buffer around the teeth, without a depth buffer: a pixel counts as red or green
     if any triangle of this colour covers its centre. With back-face culling, the counts differ by about ten pixels.
+    As in the paper, boundary pixels in the mask of the other arch count, which biases the lower arch in closed bites.
     """
 
     def __init__(self, counter: PixelCounter, scan: PaperScan, boundary_weight: float) -> None:
@@ -96,24 +97,19 @@ class PaperEnergy:
         self._counter, self._scan, self._weight = counter, scan, boundary_weight
         self.evaluations = 0
 
-    def show(self, views: Sequence[View], row: int, start: Array, other_row_hides: bool) -> None:
-        """Set the masks of one frame, in the views with a mask of arch `row`; the search starts at T_world_scan (4, 4).
-
-        With `other_row_hides`, boundary pixels inside the mask of the other arch are ignored.
-        """
+    def show(self, views: Sequence[View], row: int, start: Array) -> None:
+        """Set the masks of one frame, in the views with a mask of arch `row`, and T_world_scan (4, 4) of the start."""
         boxes = np.stack([self._box(view, start) for view in views])
         width, height = (boxes[:, 2:] - boxes[:, :2]).max(0)
         masks = np.zeros((len(views), height, width), bool)
-        free = np.zeros_like(masks)
         matrices = np.empty((len(views), 3, 4))
         for k, (view, (x0, y0, _, _)) in enumerate(zip(views, boxes, strict=True)):
             rows, columns = view.masks.shape[1:]
             inside = (slice(-y0, rows - y0), slice(-x0, columns - x0))
             masks[k][inside] = view.masks[row] > 127
-            free[k][inside] = view.masks.max(0) > 127 if other_row_hides else masks[k][inside]
             matrices[k] = np.array([[1, 0, -x0], [0, 1, -y0], [0, 0, 1]]) @ view.matrix
         self.mask_px = masks.sum((1, 2))
-        self._counter.show(matrices, masks, free)
+        self._counter.show(matrices, masks)
 
     def _box(self, view: View, start: Array) -> NDArray[np.int64]:
         """Return the box x0, y0, x1, y1 [px] around a view's masks and the initial scan; x0 and y0 are at most 0."""
@@ -137,9 +133,7 @@ class PaperEnergy:
 
 
 @numba.njit(
-    types.void(
-        _VERTICES, _FACES, _FACES, types.boolean, _MATRICES, types.int64, _SCREENS, _SCREENS, types.int64, _COUNTS
-    ),
+    types.void(_VERTICES, _FACES, _FACES, types.boolean, _MATRICES, types.int64, _SCREENS, types.int64, _COUNTS),
     nogil=True,
     cache=True,
 )
@@ -151,7 +145,6 @@ def _count(
     matrices: Singles,
     first: int,
     masks: Bits,
-    free: Bits,
     width: int,
     counts: NDArray[np.int64],
 ) -> None:
@@ -163,7 +156,7 @@ def _count(
         project(vertices, matrices[first + t], points)
         bits[:] = 0
         draw_silhouette(points, boundary_faces, 0, 0, width, cull, bits)
-        counts[t, 1] = count_and_not(bits, free[view])
+        counts[t, 1] = count_and_not(bits, masks[view])
         draw_silhouette(points, plain_faces, 0, 0, width, cull, bits)
         counts[t, 0] = count_and_not(masks[view], bits)
 
@@ -180,28 +173,21 @@ class RasterCounter:
         self._cull, self._threads = scan.cull, threads
         self._pool = ThreadPoolExecutor(threads) if threads > 1 else None
 
-    def show(self, matrices: Array, masks: Mask, free: Mask) -> None:
-        """Set the masks of one frame.
-
-        Args:
-            matrices: world [mm] to homogeneous px, per view, shape (C, 3, 4).
-            masks: the segmented teeth, shape (C, h, w).
-            free: pixels where the boundary is not counted, shape (C, h, w): the masks, and anything else that may hide
-                the boundary.
+    def show(self, matrices: Array, masks: Mask) -> None:
+        """Set the masks (C, h, w) of one frame, and the matrices (C, 3, 4) from world [mm] to homogeneous px.
 
         Raises:
             ValueError: the shapes do not agree.
         """
-        checked_screens(matrices, masks, free)
+        checked_screens(matrices, masks)
         self._matrices = np.asarray(matrices, np.float64)
         self._width = masks.shape[2]
         self._masks = np.stack([pack_bits(mask) for mask in masks])
-        self._free = np.stack([pack_bits(mask) for mask in free])
 
     def counts(self, poses: Array) -> NDArray[np.int64]:
         """Return E_SP and E_BND, the numbers of disagreeing pixels, for T_world_scan (N, 4, 4), shape (N, C, 2).
 
-        E_SP counts mask pixels not covered by the scan (eq. 8), E_BND boundary pixels outside `free` (eq. 9).
+        E_SP counts mask pixels not covered by the scan (eq. 8), E_BND boundary pixels outside the mask (eq. 9).
         """
         matrices = np.einsum("cij,njk->ncik", self._matrices, poses).reshape(-1, 3, 4).astype(np.float32)
         counts = np.empty((len(matrices), 2), np.int64)
@@ -209,7 +195,7 @@ class RasterCounter:
 
         def part(k: int) -> None:
             _count(
-                self._vertices, self._plain, self._boundary, self._cull, matrices, bounds[k], self._masks, self._free,
+                self._vertices, self._plain, self._boundary, self._cull, matrices, bounds[k], self._masks,
                 self._width, counts[bounds[k] : bounds[k + 1]],
             )  # fmt: skip
 
@@ -217,8 +203,8 @@ class RasterCounter:
         return counts.reshape(len(poses), -1, 2)
 
 
-def checked_screens(matrices: Array, masks: Mask, free: Mask) -> None:
-    """Check that matrices are (C, 3, 4) and masks and free (C, h, w) with C, h, w > 0.
+def checked_screens(matrices: Array, masks: Mask) -> None:
+    """Check that matrices are (C, 3, 4) and masks (C, h, w) with C, h, w > 0.
 
     Raises:
         ValueError: a shape is different.
@@ -228,5 +214,3 @@ def checked_screens(matrices: Array, masks: Mask, free: Mask) -> None:
         raise ValueError(
             f"matrices and masks must be (C, 3, 4) and (C, h, w), got {np.shape(matrices)} and {np.shape(masks)}"
         )
-    if np.shape(free) != np.shape(masks):
-        raise ValueError(f"free has shape {np.shape(free)}, but masks has shape {np.shape(masks)}")

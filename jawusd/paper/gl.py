@@ -61,8 +61,8 @@ void main() {{
         for (int x = corner.x; x < min(size.x, corner.x + {_TILE_PX}); x += 16) {{
             float shade = texelFetch(drawn, ivec3(x, y, layer), 0).r;
             uint mask = texelFetch(masks, ivec3(x, y, layer % views), 0).r;
-            if ((mask & 1u) != 0u && shade < 0.25) a++;
-            if ((mask & 2u) == 0u && shade > 0.75) b++;
+            if (mask == 1u && shade < 0.25) a++;
+            if (mask == 0u && shade > 0.75) b++;
         }}
     atomicAdd(bare, a);
     atomicAdd(outside, b);
@@ -136,13 +136,13 @@ class GlCounter:
         self._masks: moderngl.TextureArray | None = None
         self._most_layers = int(context.info["GL_MAX_ARRAY_TEXTURE_LAYERS"])
 
-    def show(self, matrices: Array, masks: Mask, free: Mask) -> None:
+    def show(self, matrices: Array, masks: Mask) -> None:
         """Set the masks of one frame; the arguments are those of `RasterCounter.show`.
 
         Raises:
             ValueError: the shapes do not agree, or the masks are too large for the device.
         """
-        checked_screens(matrices, masks, free)
+        checked_screens(matrices, masks)
         views, height, width = masks.shape
         size = (-(-width // _ROUND_PX) * _ROUND_PX, -(-height // _ROUND_PX) * _ROUND_PX)
         if size[0] * size[1] * views > _MOST_PIXELS or views > self._most_layers:
@@ -151,9 +151,9 @@ class GlCounter:
             self._drop_textures()
             self._masks = self._gl.texture_array((*size, views), 1, dtype="u1")
             self._masks.filter = (moderngl.NEAREST, moderngl.NEAREST)
-        # Padding is not part of the mask, and boundary pixels there are not counted.
+        # Pixels of the padding, 2, are not counted.
         flags = np.full((views, size[1], size[0]), 2, np.uint8)
-        flags[:, :height, :width] = masks + np.uint8(2) * free
+        flags[:, :height, :width] = masks
         self._masks.write(flags, alignment=1)
         # Pixel to clip coordinates, x_ndc = (2 u + 1) / w - 1, without depth; image row 0 becomes row 0 of the render
         # target.

@@ -46,9 +46,6 @@ class PaperConfig:
     dense_samples: int = 3
     dense_rad: float = radians(0.2)
     dense_mm: float = 0.1
-    # Whether to ignore boundary pixels inside the mask of the other arch. The paper counts them, which biases the lower
-    # arch away from its position behind the upper arch when the teeth are closed.
-    other_row_hides: bool = False
 
 
 @dataclass(frozen=True, eq=False)

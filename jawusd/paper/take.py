@@ -145,7 +145,7 @@ def _instant(
         if present.sum() < _FEWEST_MASKS:
             continue
         energy = energies[r]
-        energy.show([v for v, there in zip(views, present) if there], r, last[r], config.other_row_hides)
+        energy.show([v for v, there in zip(views, present) if there], r, last[r])
         poses[r] = solve_paper(energy, last[r], scans[r].centre, config).pose
         with np.errstate(invalid="ignore"):  # a mask may become empty at the working resolution
             coverage[r, present] = energy.uncovered_px(poses[r]) / energy.mask_px

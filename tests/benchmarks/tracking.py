@@ -23,7 +23,7 @@ import platform
 import subprocess
 import sys
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 ROWS = ("upper", "lower")
@@ -36,11 +36,10 @@ class Setup:
     solver: str
     backend: str
     threads: int
-    other_row_hides: bool = False
 
     def label(self) -> str:
         """Return the row's name."""
-        how = {"paper": "paper, spared" if self.other_row_hides else "paper, exact"}.get(self.solver, "default")
+        how = "paper, exact" if self.solver == "paper" else "default"
         return f"{how:<15}{self.backend:<5}{self.threads}"
 
 
@@ -49,7 +48,6 @@ SETUPS = (
     Setup("contour", "cpu", 2),
     Setup("paper", "cpu", 1),
     Setup("paper", "cpu", 2),
-    Setup("paper", "cpu", 2, other_row_hides=True),
     Setup("paper", "gl", 1),
     Setup("paper", "gl", 2),
 )
@@ -92,7 +90,6 @@ def run_setup(path: Path, setup: Setup, windows: int, length: int) -> dict:
     from jawusd.formats.mesh import tooth_labels
     from jawusd.geometry import transform_points
     from jawusd.paper import take as paper_take
-    from jawusd.paper.solver import PaperConfig
     from jawusd.pipeline.cameras import load_cameras
     from jawusd.pipeline.subject import load_meshes, subject_of_capture
     from jawusd.tracking import track_capture
@@ -106,14 +103,13 @@ def run_setup(path: Path, setup: Setup, windows: int, length: int) -> dict:
     scans = [meshes[f"{row}_teeth"] for row in ROWS]
     watch = Watch(*((paper_take, "solve_paper") if setup.solver == "paper" else (ContourSolver, "solve")))
     landmarks = subject_of_capture(capture, meshes).landmarks
-    config = replace(PaperConfig(), other_row_hides=setup.other_row_hides)
     times: list[list[float]] = []
     errors: dict[str, list[float]] = {row: [] for row in ROWS}
     for start in np.linspace(0, len(truth["frames"]) - length, windows).round().astype(int):
         window = cut(capture, cameras, scans, truth, int(start), length)
         if setup.solver == "paper":
             options = {"backend": setup.backend, "threads": setup.threads, "progress": watch.mark}
-            tracks = paper_take.track_capture_paper(window, cameras, offsets, *scans, config, **options)
+            tracks = paper_take.track_capture_paper(window, cameras, offsets, *scans, **options)
         else:
             options = {"threads": setup.threads, "progress": watch.mark}
             tracks = track_capture(window, cameras, offsets, *scans, landmarks, **options)

@@ -61,13 +61,12 @@ def drawn(faces: np.ndarray, matrix: np.ndarray, pose: np.ndarray) -> np.ndarray
     return raster.unpack_bits(bits, SIZE[0])
 
 
-def screens() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return matrices, masks drawn at another pose, and free areas larger than the masks."""
+def screens() -> tuple[np.ndarray, np.ndarray]:
+    """Return matrices, and masks drawn at another pose, with an area in which there is no boundary outside."""
     P = matrices()
     masks = np.stack([drawn(FACES, m, some_poses(1, seed=9)[0]) for m in P])
-    free = masks.copy()
-    free[:, :50, :90] = True
-    return P, masks, free
+    masks[:, :50, :90] = True
+    return P, masks
 
 
 @pytest.fixture(scope="module")
@@ -81,27 +80,27 @@ def context():
 
 
 def test_the_cpu_counts_what_numpy_counts() -> None:
-    P, masks, free = screens()
+    P, masks = screens()
     poses = some_poses(5)
     counter = RasterCounter(scan())
-    counter.show(P, masks, free)
+    counter.show(P, masks)
     found = counter.counts(poses)
     assert found.shape == (5, VIEWS, 2)
     for n, pose in enumerate(poses):
         for c, m in enumerate(P):
             assert found[n, c, 0] == np.count_nonzero(masks[c] & ~drawn(FACES, m, pose))
-            assert found[n, c, 1] == np.count_nonzero(drawn(BOUNDARY, m, pose) & ~free[c])
+            assert found[n, c, 1] == np.count_nonzero(drawn(BOUNDARY, m, pose) & ~masks[c])
     assert (found > 0).any(axis=(0, 1)).all()
 
 
 @pytest.mark.parametrize("options", [{"threads": 2}, {"threads": 3, "cull": True}, {"cull": True}])
 def test_threads_and_culling_leave_the_silhouette_of_a_solid_alone(options) -> None:
-    P, masks, free = screens()
+    P, masks = screens()
     poses = some_poses(7)
     results = []
     for chosen in ({}, options):
         counter = RasterCounter(scan(cull=chosen.get("cull", False)), chosen.get("threads", 1))
-        counter.show(P, masks, free)
+        counter.show(P, masks)
         results.append(counter.counts(poses))
     np.testing.assert_array_equal(results[0][..., 0], results[1][..., 0])
     if "cull" not in options:  # the far side of the boundary may lie outside the mask
@@ -111,13 +110,13 @@ def test_threads_and_culling_leave_the_silhouette_of_a_solid_alone(options) -> N
 
 @pytest.mark.parametrize("cull", [False, True])
 def test_opengl_agrees_with_the_cpu(context, cull) -> None:
-    P, masks, free = screens()
+    P, masks = screens()
     poses = some_poses(20)
     cpu = RasterCounter(scan(cull=cull))
-    cpu.show(P, masks, free)
+    cpu.show(P, masks)
     expected = cpu.counts(poses)
     counter = gl.GlCounter(context, scan(cull=cull))
-    counter.show(P, masks, free)
+    counter.show(P, masks)
     found = counter.counts(poses)
     assert np.abs(found - expected).max() <= EDGE_TIES_PX
     assert expected.max() > 100 * EDGE_TIES_PX
@@ -128,26 +127,26 @@ def test_opengl_agrees_with_the_cpu(context, cull) -> None:
 
 
 def test_opengl_splits_what_is_too_much_for_one_drawing(context, monkeypatch) -> None:
-    P, masks, free = screens()
+    P, masks = screens()
     poses = some_poses(9)
     counter = gl.GlCounter(context, scan())
-    counter.show(P, masks, free)
+    counter.show(P, masks)
     whole = counter.counts(poses)
     monkeypatch.setattr(gl, "_MOST_PIXELS", 256 * 192 * 2 * VIEWS)  # two poses at a time
     np.testing.assert_array_equal(counter.counts(poses), whole)
     monkeypatch.setattr(gl, "_MOST_PIXELS", 256 * 192)
     with pytest.raises(ValueError, match="exceed the maximum size of a texture"):
-        counter.show(P, masks, free)
+        counter.show(P, masks)
 
 
 def test_counters_share_a_context_and_take_pictures_of_changing_size(context) -> None:
-    P, masks, free = screens()
+    P, masks = screens()
     pose = some_poses(1)
     first = gl.GlCounter(context, scan())
     second = gl.GlCounter(context, scan(FACES, np.empty((0, 3), np.int32)))
     cpu = RasterCounter(scan())
     for views, width, height in ((3, 200, 130), (2, 70, 60), (1, 130, 129), (3, 200, 130)):
-        part = (P[:views], masks[:views, :height, :width], free[:views, :height, :width])
+        part = (P[:views], masks[:views, :height, :width])
         for counter in (first, second, cpu):
             counter.show(*part)
         expected = cpu.counts(pose)
@@ -156,19 +155,17 @@ def test_counters_share_a_context_and_take_pictures_of_changing_size(context) ->
         assert not second.counts(pose)[..., 1].any()
 
 
-@pytest.mark.parametrize("change", ["matrices", "masks", "free", "empty"])
+@pytest.mark.parametrize("change", ["matrices", "masks", "empty"])
 def test_wrong_shapes_are_refused(change) -> None:
-    P, masks, free = screens()
+    P, masks = screens()
     if change == "matrices":
         P = P[:2]
     elif change == "masks":
         masks = masks[0]
-    elif change == "free":
-        free = free[:, :-1]
     else:
-        masks = free = masks[:, :0]
-    with pytest.raises(ValueError, match="masks must be|free"):
-        RasterCounter(scan()).show(P, masks, free)
+        masks = masks[:, :0]
+    with pytest.raises(ValueError, match="masks must be"):
+        RasterCounter(scan()).show(P, masks)
 
 
 def test_no_driver_is_one_clear_error(monkeypatch) -> None:

@@ -64,10 +64,10 @@ def shifted(x_mm: float, y_mm: float) -> np.ndarray:
     return make_transform(np.eye(3), [x_mm, y_mm, 0.0])
 
 
-def energy_of(views, poses, row=0, other_row_hides=False):
+def energy_of(views, poses, row=0):
     scan = paper_scan(plate(), "upper")
     energy = PaperEnergy(RasterCounter(scan), scan, LAMBDA)
-    energy.show(views, row, np.eye(4), other_row_hides)
+    energy.show(views, row, np.eye(4))
     return energy(np.stack(poses)), [energy.uncovered_px(pose) for pose in poses]
 
 
@@ -101,12 +101,11 @@ def test_views_add_up_and_a_crop_of_the_picture_changes_nothing() -> None:
     np.testing.assert_array_equal(bare[0], [bare[0][0]] * 2)
 
 
-def test_the_other_row_hides_the_boundary_only_on_request() -> None:
+def test_the_boundary_counts_behind_the_other_row() -> None:
     other = box(slice(40, 50), slice(0, 64))
     mine = PLATE & ~other
     view = plate_view(mine, other)
     np.testing.assert_allclose(energy_of([view], [np.eye(4)])[0], LAMBDA * 4 * 40)
-    np.testing.assert_allclose(energy_of([view], [np.eye(4)], other_row_hides=True)[0], 0)
     swapped = View(view.matrix, view.eye, view.masks[::-1], view.present)
     np.testing.assert_allclose(energy_of([swapped], [np.eye(4)], row=1)[0], LAMBDA * 4 * 40)
 
