@@ -244,4 +244,15 @@ _CLASSES = (
     JAWUSD_PT_sliders,
     JAW_PT_export,
 )
-register, unregister = bpy.utils.register_classes_factory(_CLASSES)
+
+
+def register() -> None:
+    """Register the operators and the panels."""
+    for cls in _CLASSES:
+        bpy.utils.register_class(cls)
+
+
+def unregister() -> None:
+    """Unregister the panels and the operators."""
+    for cls in reversed(_CLASSES):
+        bpy.utils.unregister_class(cls)
