@@ -161,7 +161,8 @@ class JawScene:
             if visible:
                 T = self._T_world_skull @ T_skull_mandible[k]
                 ghost.position, ghost.wxyz = tuple(T[:3, 3]), tuple(wxyz_from_matrix(T[:3, :3]))
-            ghost.visible = visible
+            if ghost.visible != visible:
+                ghost.visible = visible
 
     def _add_ghost(self, name: str) -> viser.FrameHandle:
         ghost = self._scene.add_frame(name, show_axes=False)
@@ -187,14 +188,16 @@ class JawScene:
             ends = transform_points(self._T_world_skull, np.stack([held_skull, pointer_skull]))
             self._held.position = tuple(ends[0])
             self._line.points = ends[None].astype(np.float32)
-        self._held.visible = self._line.visible = visible
+        if self._held.visible != visible:
+            self._held.visible = self._line.visible = visible
 
     def show_pins(self, places_skull: dict[str, Array]) -> None:
         """Mark the pinned landmarks at their positions (3,) [mm] in the skull frame."""
         for name, ball in self._pins.items():
             if name in places_skull:
                 ball.position = tuple(transform_point(self._T_world_skull, places_skull[name]))
-            ball.visible = name in places_skull
+            if ball.visible != (name in places_skull):
+                ball.visible = name in places_skull
 
     def skull_from_page(self, position: tuple[float, float, float]) -> Array:
         """Transform a position from the page's world to the skull frame [mm], shape (3,)."""

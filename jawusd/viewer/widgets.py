@@ -55,8 +55,9 @@ def add_dark_checkbox(client: viser.ClientHandle) -> None:
 
 
 def assign(widget: viser.GuiInputHandle[Value], value: Value) -> None:
-    """Set the value of a widget."""
-    widget.value = value  # type: ignore[misc]  # mypy does not find viser's setter
+    """Set the value of a widget if it differs from the current one, to avoid redundant messages to the page."""
+    if widget.value != value:
+        widget.value = value  # type: ignore[misc]  # mypy does not find viser's setter
 
 
 class _Widget(Protocol):
@@ -67,8 +68,9 @@ class _Widget(Protocol):
 def enable(widget: _Widget, on: bool) -> None:
     """Enable or disable a widget; hide button groups, which viser cannot disable."""
     if isinstance(widget, viser.GuiButtonGroupHandle):
-        widget.visible = on
-    else:
+        if widget.visible != on:
+            widget.visible = on
+    elif widget.disabled == on:
         widget.disabled = not on
 
 
