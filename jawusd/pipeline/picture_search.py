@@ -31,10 +31,9 @@ _MOST_BRIDGED = 0.1
 # Minimum length of the head's unit up vector projected to the image plane; a shorter one does not determine how the
 # image is turned.
 _SHORTEST_UP = 0.5
-# Limits of the fraction of the visible contour that matches the colours, with several cameras and with one, for which
-# lips count as hiding the contour (`RigTracker.first_fit`). Starts below the first are rejected; one above the second
-# ends the search. See docs/explanation/constants.md.
-_LEAST_FIT, _CLEAR_FIT = (0.15, 0.4), (0.25, 0.6)
+# Fractions of the contour in sight that must match the colours, with several cameras and with one: minimum for a
+# searched start, and value at which the search ends; and minimum for picks. See docs/explanation/constants.md.
+_LEAST_FIT, _CLEAR_FIT, _LEAST_PICKED_FIT = (0.38, 0.4), (0.5, 0.6), 0.3
 
 T = TypeVar("T")
 T_co = TypeVar("T_co", covariant=True)
@@ -54,7 +53,7 @@ class StartInFrame(Protocol[T_co]):
 
 @dataclass(frozen=True, eq=False)
 class Start(Generic[T]):
-    """A start of tracking: frame, pose, fraction of the visible contour that fits, and how it was found."""
+    """A start of tracking: frame, pose, fraction of the contour in sight that fits, and how it was found."""
 
     frame: int
     pose: T
@@ -88,7 +87,7 @@ class PictureSearch(Generic[T]):
     cameras: Mapping[str, Camera]  # the calibrated cameras that have a video, by name
     offsets: Mapping[str, int]  # frame offset by camera
     near: StartInFrame[T]  # estimates the pose in a frame from rough masks or picks
-    #: refines a pose in a frame; returns the pose and the fraction (0 .. 1) of the visible contour that fits
+    #: refines a pose in a frame; returns the pose and the fraction (0 .. 1) of the contour in sight that fits
     judged: Callable[[int, T], tuple[T, float]]
 
     def run(self, frames: range, progress: Progress, up_world: Array | None = None) -> Start[T]:
@@ -96,8 +95,8 @@ class PictureSearch(Generic[T]):
 
         Without `up_world`, the up direction of the head in the world (3,), four camera orientations are tried. If it is
         known from other frames, only one is tried and, with several cameras, the first start that fits is returned,
-        because it can be compared with those frames. If no start of several cameras fits, starts of single cameras are
-        tried in the frame with the best one.
+        because it can be compared with those frames. If no start of several cameras fits clearly, starts of single
+        cameras are tried in the frame with the best one.
 
         Raises:
             TrackingError: no start fits.
@@ -124,9 +123,7 @@ class PictureSearch(Generic[T]):
                         best, nearest = found, candidate
                     if best is not None and best.fit >= clear:
                         return best
-            if best is not None and best.fit >= least:
-                return best
-            if len(tried) >= _MOST_TRIED:
+            if len(tried) >= _MOST_TRIED or (best is not None and best.fit >= least):
                 break
         best = max(filter(None, [best, *self._alone(nearest)]), key=lambda start: start.fit, default=None)
         if best is not None and best.fit >= least:
@@ -158,8 +155,8 @@ class PictureSearch(Generic[T]):
             for name, rows in candidate.rows.items():
                 yield self._at(replace(candidate, rows={name: rows}))
 
-    def picked(self, picks: Bootstrap, frames: range, least_fit: float) -> Start[T]:
-        """Return a start from picks in the frames to be tracked; at least `least_fit` of the visible contour must fit.
+    def picked(self, picks: Bootstrap, frames: range) -> Start[T]:
+        """Return a start from picks in the frames to be tracked.
 
         Raises:
             TrackingError: the frame is outside the range, or the picks are inconsistent or do not match the images.
@@ -168,10 +165,10 @@ class PictureSearch(Generic[T]):
         if picks.frame not in frames:
             raise picks_outside(picks.frame, frames)
         pose, fit = self.judged(picks.frame, self.near.picked(picks, self.cameras))
-        if fit < least_fit:
+        if fit < _LEAST_PICKED_FIT:
             raise TrackingError(
-                f"the picks do not match the images: {fit:.0%} of the visible contour agrees with the image "
-                f"colours; at least {least_fit:.0%} is needed",
+                f"the picks do not match the images: {fit:.0%} of the contour in sight agrees with the image "
+                f"colours; at least {_LEAST_PICKED_FIT:.0%} is needed",
                 frame=picks.frame,
                 hint="Check the picks, and that scans, rig and calibration belong to this subject and these cameras.",
             )
@@ -179,7 +176,7 @@ class PictureSearch(Generic[T]):
 
 
 def least_fit(cameras: int) -> float:
-    """Return the minimum fraction of the visible contour that must fit for a start with some cameras to be accepted."""
+    """Return the minimum fraction of the contour in sight that must fit for a start with that many cameras."""
     return _LEAST_FIT[cameras == 1]
 
 
@@ -222,7 +219,7 @@ def _describe_failure(tried: Sequence[int], best: Start[T] | None, least: float,
     if frames:
         found += f" ({', '.join(map(str, frames))})"
     if best is not None:
-        found += f"; at best {best.fit:.0%} of the visible contour fits; at least {least:.0%} is needed"
+        found += f"; at best {best.fit:.0%} of the contour in sight fits; at least {least:.0%} is needed"
     if left:
         found += f"; frames {left[0]} to {left[-1]} were not searched, because at most {_MOST_TRIED} starts are tried"
     return found

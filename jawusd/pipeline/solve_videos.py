@@ -14,7 +14,7 @@ from jawusd.formats.mesh import Mesh
 from jawusd.formats.performance import Performance
 from jawusd.geometry import Camera
 from jawusd.pipeline.cameras import open_videos
-from jawusd.pipeline.picture_search import PictureSearch, Start, least_fit
+from jawusd.pipeline.picture_search import PictureSearch, Start
 from jawusd.pipeline.state import Progress
 from jawusd.pipeline.subject import subject_of_capture
 from jawusd.pipeline.track_videos import Cutter
@@ -101,7 +101,7 @@ class VideoShot:
         """
         picks = self._picks
         if picks is not None and len(self.cameras) > 1:
-            return self._search.picked(picks, self._frames, least_fit(len(self.cameras)))
+            return self._search.picked(picks, self._frames)
         return self._search.run(self._frames, self._progress)
 
     def _again(self, frames: range, up_world: Array) -> tuple[int, Pose]:

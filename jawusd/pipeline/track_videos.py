@@ -95,7 +95,7 @@ class Follower:
     def start_at(self, frame: int, poses: Array) -> tuple[Array, float]:
         """Refine T_world_upper, T_world_lower (2, 4, 4) in the frame from which `run` will start; return them, and fit.
 
-        The fit is the fraction of the visible contour that matches the colours, 0 .. 1, for the worse arch.
+        The fit is the fraction of the contour in sight that matches the colours, 0 .. 1, for the worse arch.
         """
         cutter = Cutter(self.cameras, self._scans, teeth_centre(self._scans, poses), self._pool)
         axes = self._subject.T_anatomical_skull[:3, :3]
@@ -150,11 +150,6 @@ class Follower:
             yield found
 
 
-# Minimum fraction of the visible contour that matches the colours for picks to be accepted. Nine path-traced mouths,
-# dark and noisy ones included, reached 0.13 to 0.5; a wrong focal length or another subject's scan gave 0.05 to 0.12.
-_LEAST_PICKED_FIT = 0.1
-
-
 def track_videos(
     capture: Capture, offsets: dict[str, int], meshes: Mapping[str, Mesh], jobs: int, progress: Progress
 ) -> Tracks:
@@ -176,7 +171,7 @@ def track_videos(
         if capture.bootstrap is None:
             begin = follower.start_by(search, frames, progress)
         else:
-            begin = search.picked(capture.bootstrap, frames, _LEAST_PICKED_FIT)
+            begin = search.picked(capture.bootstrap, frames)
         followed = follower.run(frames, search, progress)
     facts = TakeFacts(
         tuple(cameras.values()),

@@ -1,6 +1,5 @@
 """Overlays of a small capture: the decoded videos must be tinted where OpenCV projects the scans."""
 
-
 import av
 import cv2
 import numpy as np

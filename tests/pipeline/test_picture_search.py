@@ -80,7 +80,7 @@ def test_a_long_take_without_teeth_ends_and_says_what_was_tried(searched):
 
 def test_the_best_poor_fit_is_told(searched):
     words, _, _ = searched(lambda frame: 0.5 * LEAST_FIT if frame == 18 else 0.01)
-    assert f"at best {0.5 * LEAST_FIT:.0%} of the visible contour fits" in words
+    assert f"at best {0.5 * LEAST_FIT:.0%} of the contour in sight fits" in words
 
 
 def test_teeth_in_a_later_part_are_found(searched):
@@ -105,8 +105,8 @@ def test_teeth_are_found_by_cameras_that_are_turned(searched, upright):
 def test_an_unclear_fit_is_compared_with_the_other_orientations(searched):
     """Arches that hang upside down in the images may fit a little."""
     fits = iter([LEAST_FIT + 0.01] * 4 + [LEAST_FIT + 0.05] + [0.01] * 7)
-    begin, tried, _ = searched(lambda frame: next(fits), upright=None)
-    assert begin.fit == LEAST_FIT + 0.05 and len(tried) == 12
+    begin, tried, _ = searched(lambda frame: next(fits), upright=None, alone=dict.fromkeys(CAMERAS, 0.01))
+    assert begin.fit == LEAST_FIT + 0.05 and len(tried) == 12 + 2
 
 
 def test_frames_that_show_most_of_both_arches_are_tried_first(searched):
@@ -116,12 +116,11 @@ def test_frames_that_show_most_of_both_arches_are_tried_first(searched):
     assert tried[:3] == [34, 42, 10]
 
 
-def test_one_camera_needs_a_better_fit(searched):
-    fit = least_fit(1) - 0.01
-    assert fit > LEAST_FIT
-    assert searched(lambda frame: fit)[0].fit == fit
-    words, _, _ = searched(lambda frame: fit, cameras=["cam0"])
-    assert f"at best {fit:.0%} of the visible contour fits; at least {least_fit(1):.0%} is needed" in words
+def test_one_camera_needs_a_better_fit_to_end_the_search(searched):
+    """With several cameras, 55 % of the contour in sight is clear."""
+    assert [len(searched(lambda frame: 0.55, cameras=names)[1]) for names in (["cam0", "cam1"], ["cam0"])] == [1, 3]
+    words, _, _ = searched(lambda frame: LEAST_FIT, cameras=["cam0"])
+    assert f"at best {LEAST_FIT:.0%} of the contour in sight fits; at least {least_fit(1):.0%} is needed" in words
 
 
 def test_starts_of_single_cameras_are_tried_if_those_of_several_do_not_fit(searched):
@@ -129,7 +128,7 @@ def test_starts_of_single_cameras_are_tried_if_those_of_several_do_not_fit(searc
     begin, tried, _ = searched(lambda frame: 0.5 * LEAST_FIT if frame == 18 else 0.01, alone=fits)
     assert (begin.frame, begin.fit) == (18, fits["cam1"]) and tried[-2:] == [18, 18]
     words, _, _ = searched(lambda frame: 0.01, alone=dict.fromkeys(fits, 0.9 * LEAST_FIT))
-    assert f"at best {0.9 * LEAST_FIT:.0%} of the visible contour fits" in words
+    assert f"at best {0.9 * LEAST_FIT:.0%} of the contour in sight fits" in words
 
 
 @pytest.mark.parametrize("quarters", [(0, 0, 0), (1, 0, 0), (0, 2, 0), (0, 0, 3), (1, 1, 1), (2, 2, 2), (3, 1, 0)])

@@ -20,9 +20,7 @@ from jawusd.tracking.sequence.model_refinement import hard_frames, refine_tracks
 COUNT = 24
 SPREAD_MM = 0.1
 HIDDEN = (10, 11)
-LIP_MM = (
-    3.8  # height of the lower lip over the lower incisal point: crown edges stay visible
-)
+LIP_MM = 3.8  # height of the lower lip over the lower incisal point: crown edges stay visible
 
 
 @pytest.fixture(scope="module")

@@ -170,7 +170,7 @@ def test_unclear_starts_of_one_camera_are_also_aligned_from_elsewhere(monkeypatc
     tracker.begin(None, Pose(np.eye(4), np.array([5.0, 1.0, 1.0])), searched=searched)
     elsewhere = [[-8, 0, 0], [8, 0, 0], [0, 0, -7], [0, 0, 7]]
     assert tried == [[0, 0, 0]] * (2 if cameras == 1 else 1) + elsewhere[:others]
-    assert tracker.first_fit == (0.2 if cameras > 1 else 0.9 if others else fit)
+    assert tracker.first_fit == (0.9 if others else fit)
 
 
 def test_without_teeth_no_border_is_found():

@@ -57,8 +57,7 @@ class RigTracker:
 
     Attributes:
         expected: pose prior of the last step.
-        first_fit: matched fraction of the visible contour in the first frame, 0 .. 1, of the worse arch; with one
-            camera, of the contour in sight.
+        first_fit: matched fraction of the contour in sight in the first frame, 0 .. 1, of the worse arch.
     """
 
     def __init__(
@@ -109,7 +108,7 @@ class RigTracker:
         fit = begun.look.fit(begun.found, np.ones(2, bool), self._free_focal)
         self._motion = Prediction(self._coordinates, begun.found.pose, fit.found, head=self._head)
         self._first = fitting_share(begun.rough.solution)
-        self.first_fit = begun.fit if alone else begun.share
+        self.first_fit = begun.fit
         self._usual.append(self._first)
         return fit
 

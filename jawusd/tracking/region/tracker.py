@@ -25,7 +25,15 @@ from jawusd.tracking.contour.views import View
 from jawusd.tracking.initialization.first_frame import FIRST_ROUNDS
 from jawusd.tracking.region.appearance import CORRELATION_PX, FIRST_RATES, RATES, Cut, LearnedColours, Picture
 from jawusd.tracking.region.effort import THOROUGH
-from jawusd.tracking.region.search import AGAIN, LEAST_USUAL, USUAL_FRAMES, InstantViews, PoseSearch, fitting_share
+from jawusd.tracking.region.search import (
+    AGAIN,
+    LEAST_USUAL,
+    USUAL_FRAMES,
+    InstantViews,
+    PoseSearch,
+    fitting_share,
+    fraction_in_sight,
+)
 from jawusd.tracking.sequence.history import MotionPredictor
 
 # Fractions of the usual matched contour length below which, in this order, wider residual gates are tried, the jaw is
@@ -70,7 +78,11 @@ class RegionPose:
 
 
 class RegionTracker:
-    """Tracker of both arches in images of several cameras; colours are learned while tracking."""
+    """Tracker of both arches in images of several cameras; colours are learned while tracking.
+
+    Attributes:
+        first_fit: matched fraction of the contour in sight in the first frame, 0 .. 1, of the worse arch.
+    """
 
     def __init__(
         self,
@@ -90,7 +102,7 @@ class RegionTracker:
         """
         self._search = PoseSearch(scans, landmarks, axes, config, executor)
         self._colours = LearnedColours(scans, cameras, axes)
-        self._first_share = np.zeros(2)
+        self._first_share, self.first_fit = np.zeros(2), 0.0
 
     def begin(self, cut: Cut, poses: Array) -> RegionPose:
         """Learn the colours of a first frame at poses accurate to a few tenths of a millimetre, and refine them."""
@@ -102,7 +114,7 @@ class RegionTracker:
             solution = instant.polished(rough)
             poses = solution.poses
             instant.learn(poses, FIRST_RATES)
-        self._first_share = fitting_share(rough)
+        self._first_share, self.first_fit = fitting_share(rough), instant.first_fit(solution)
         objective_px = self._search.objective_px(solution)
         return RegionPose(poses, np.ones(2, bool), _covariance(solution), objective_px, solution)
 
@@ -114,11 +126,6 @@ class RegionTracker:
             poses: T_world_upper and T_world_lower in that frame, shape (2, 4, 4).
         """
         return self._colours.views(pictures, poses)
-
-    @property
-    def first_fit(self) -> float:
-        """Matched fraction of the visible contour in the first frame, 0 .. 1; the smaller value of both arches."""
-        return float(self._first_share.min())
 
     def follow(self, cuts: Iterator[Cut], poses: Array) -> Iterator[RegionPose]:
         """Yield the poses of consecutive frames, forwards or backwards from a first frame with given poses.
@@ -145,6 +152,10 @@ class _Instant:
     def polished(self, solution: Solution, *, firm: bool = False) -> Solution:
         """Refine an alignment with all faces of the scans."""
         return self._search.polished(solution, self._counting, self.look, firm=firm)
+
+    def first_fit(self, polished: Solution) -> float:
+        """Return the matched fraction of the contour in sight, of the worse arch, 0 .. 1."""
+        return float(fraction_in_sight(polished, self._counting).min())
 
     def learn(self, poses: Array, rates: tuple[float, float]) -> None:
         """Update the colour models from both sides of the borders matched in the refined alignment."""
