@@ -6,14 +6,14 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from typing import Protocol, TypeVar
 
-_Item = TypeVar("_Item")
-_Result = TypeVar("_Result")
+Item = TypeVar("Item")
+Result = TypeVar("Result")
 
 
 class Mapper(Protocol):
     """Map a function over items in order, like the built-in `map`, possibly in threads."""
 
-    def __call__(self, function: Callable[[_Item], _Result], items: Iterable[_Item], /) -> Iterable[_Result]:
+    def __call__(self, function: Callable[[Item], Result], items: Iterable[Item], /) -> Iterable[Result]:
         """Return the results in the order of the items."""
         ...
 
@@ -83,8 +83,7 @@ class TrackingConfig:
     # Ratio of true to measured correlation length [-]: the fit absorbs part of the error, and the Tukey weight loses
     # efficiency.
     tile_factor: float = 2.2
-    # Number of recent good frames that define the usual residual and coverage: about a second.
-    history_frames: int = 31
+    history_frames: int = 31  # number of recent good frames that define the usual residual and coverage: about a second
     # Number of recent good frames that define the usual score: shorter than the time in which lips close, and longer
     # than that in which a pose is lost.
     score_frames: int = 7
@@ -99,8 +98,7 @@ class TrackingConfig:
     suspect_coverage: float = 0.04
     # Multiple of the arch's recent median residual above which the mask of one view is suspect [-].
     uneven_residual: float = 1.6
-    # Fraction of a mask's recent median score below which the mask does not show the arch [-].
-    dead_score: float = 0.03
+    dead_score: float = 0.03  # fraction of a mask's recent median score below which the mask does not show the arch [-]
     # Matched contour [px] that outweighs one uncovered mask pixel: rejects wrong minima if few edges are visible.
     uncovered_price: float = 0.5
     # Minimum gain in the objective of the other masks, relative to their score, for excluding a mask as wrong [-].
@@ -113,15 +111,13 @@ class TrackingConfig:
     # Residual gates of the short trial alignment from every start [px], and number of starts that are refined fully.
     trial_gates_px: tuple[float, ...] = (14.0, 8.0)
     search_finalists: int = 4
-    # Matched contour length below which an arch is lost [px]: 8 mm of tooth edge.
-    least_matched_px: float = 60.0
+    least_matched_px: float = 60.0  # matched contour length below which an arch is lost [px]: 8 mm of tooth edge
     # Multiple of the limit for suspect residuals above which an arch is lost [-]; if the score is low as well, a
     # suspect residual suffices.
     lost_residual: float = 1.3
     # Uncovered fraction of a mask above which its arch is lost [-]: good poses leave about 0.01.
     lost_coverage: float = 0.12
-    # Position uncertainty of the crowns above which an arch is lost [mm].
-    lost_sigma_mm: float = 0.5
+    lost_sigma_mm: float = 0.5  # position uncertainty of the crowns above which an arch is lost [mm]
     # Minimum matched fraction of the visible contour in the first frame [-]: correct poses reach 0.15 with nearly
     # closed lips, and 0.07 with scans without gum. Wrong poses can exceed this fraction, but are rejected because they
     # leave masks uncovered.

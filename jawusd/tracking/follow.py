@@ -39,42 +39,29 @@ P = TypeVar("P", bound=Located)
 
 @dataclass(frozen=True, eq=False)
 class Begin(Generic[P]):
-    """A frame from which a take is followed.
-
-    Attributes:
-        frame, pose: the frame and its pose.
-        follow: yields the poses of frames in tracking order, next to a given pose. Every call starts with the colours
-            learned in the first frame.
-    """
+    """A frame from which a take is followed."""
 
     frame: int
     pose: P
+    #: yields the poses of frames in tracking order, next to a given pose; each call starts with the colours of the
+    #: first frame
     follow: Callable[[range, P], Iterator[P]]
 
 
 @dataclass(eq=False)
 class TwoWays(Generic[P]):
-    """Poses of a take, followed in both directions.
+    """Poses of a take, followed in both directions."""
 
-    Attributes:
-        frames: all frames.
-        places: returns points of the lower teeth in the frame of the upper teeth [mm], shape (N, 3).
-        fit_px: returns the length of the contour that fits a pose [px].
-        margin: ratio of these lengths above which another pose replaces a trusted one.
-        jump_mm: second difference of the motion of the lower teeth above which earlier frames are followed again [mm].
-        patience: number of successive lost frames without a newly found arch after which tracking backwards ends.
-        progress: called with the number of frames followed and the total.
-        known: poses by frame.
-    """
-
-    frames: range
-    places: Callable[[P], Array]
-    fit_px: Callable[[P], float]
-    margin: float = 1.0
+    frames: range  # all frames
+    places: Callable[[P], Array]  # returns points of the lower teeth in the frame of the upper teeth [mm], shape (N, 3)
+    fit_px: Callable[[P], float]  # returns the length of the contour that fits a pose [px]
+    margin: float = 1.0  # ratio of these lengths above which another pose replaces a trusted one
+    #: second difference of the motion of the lower teeth above which earlier frames are followed again [mm]
     jump_mm: float = _JUMP_MM
-    patience: int = 1
+    patience: int = 1  # number of successive lost frames without a newly found arch after which tracking backwards ends
+    #: called with the number of frames followed and the total
     progress: Callable[[int, int], None] = lambda done, total: None
-    known: MutableMapping[int, P] = field(default_factory=dict)
+    known: MutableMapping[int, P] = field(default_factory=dict)  # poses by frame
 
     def follow(self, begin: Begin[P]) -> None:
         """Follow the teeth from one frame to both ends, and backwards from frames before which poses may be wrong.
@@ -104,8 +91,8 @@ class TwoWays(Generic[P]):
 
         Args:
             search: searches in lost frames, given the nearest found pose. Raises TrackingError if it finds nothing.
-            follow: as in `Begin`, with colours that were learned in a good frame of the take. With it, lost frames are
-                followed once more from where the teeth were found, since such frames are often blurred or dark.
+            follow: as in `Begin`, with colours of a good frame: follows lost frames once more, often blurred or dark
+                ones.
             fit: measure by which the better of both poses is chosen, comparable between colours; `fit_px` by default.
         """
         if not any(pose.found.all() for pose in self.known.values()):
@@ -141,18 +128,14 @@ class TwoWays(Generic[P]):
     ) -> bool | None:
         """Replace poses with others of the same frames, up to the first trusted pose that agrees or fits better.
 
-        A trusted pose is replaced only if the other pose fits better; in other frames, the better of both poses is
-        kept.
-
         Args:
-            way: frames in tracking order.
-            followed: other poses of these frames.
+            way, followed: frames in tracking order, and other poses of these frames.
             doubted: frames whose poses are not trusted.
             fit: measure of the better pose; `fit_px` by default.
 
         Returns:
             True if a trusted pose is equal, or differs little and fits better; False if a trusted pose fits better and
-            contradicts the other; None if an arch was lost and no other arch found, or if the take ended.
+                contradicts the other; None if an arch was lost and no other arch found, or if the take ended.
         """
         misses, fit = 0, fit or self.fit_px
         for frame, other in zip(way, followed, strict=False):
@@ -173,16 +156,13 @@ class TwoWays(Generic[P]):
     def unconfirmed(self, follow: Callable[[range, P], Iterator[P]]) -> dict[int, float]:
         """Return minimum standard deviations of the lower teeth [mm] near lost frames and jumps, by frame.
 
-        Just before a tracker loses the teeth, or after it has found them, a pose may be wrong although it fits. From
-        the frame next to each loss, the take is therefore followed away from the loss until a trusted pose is
-        confirmed. Up to that frame, the standard deviation is at least the distance between the known and the new pose;
-        next to the loss, it is also at least the second difference of the motion.
+        Just before a tracker loses the teeth, or after it has found them, a pose may be wrong although it fits. The
+        take is therefore followed, as in `Begin`, away from each loss until a trusted pose is confirmed. Up to that
+        frame, the standard deviation is at least the distance between the known and the new pose; next to the loss, it
+        is also at least the second difference of the motion.
 
-        Where the jaw still accelerates implausibly, the poses on one side are wrong. The take is followed from each
-        side into the other one; where the poses of both sides fit about equally well, neither is confirmed.
-
-        Args:
-            follow: as in `Begin`.
+        Where the jaw still accelerates implausibly, the take is followed from each side into the other one; where the
+        poses of both sides fit about equally well, neither is confirmed.
         """
         least_mm: dict[int, float] = {}
         for lost in lost_stretches(self.known, self.frames, shortest=1):
@@ -225,10 +205,7 @@ class TwoWays(Generic[P]):
             yield frame, away_mm
 
     def _turning_points(self, way: range) -> Iterator[int]:
-        """Yield the frames that are trusted more than their predecessor, or at which the jaw accelerates implausibly.
-
-        The caller may replace poses between iterations.
-        """
+        """Yield the frames that are trusted more than the one before, or where the jaw accelerates implausibly."""
         for k in range(1, len(way)):
             jumps = k > 1 and self._bend_mm(way[k - 2 : k + 1]) > self.jump_mm
             pose, last = self.known[way[k]], self.known[way[k - 1]]

@@ -8,7 +8,8 @@ from bumpy_teeth import arch, jaw_poses, make_cameras, render_masks, vertex_erro
 
 from jawusd.geometry import make_transform, se3_exp, se3_inverse, transform_point
 from jawusd.tracking import TrackingConfig
-from jawusd.tracking.contour.rendering import Contour, Drawing, Drawings
+from jawusd.tracking.contour import rendering as rendering_module
+from jawusd.tracking.contour.rendering import Drawing, Drawings
 from jawusd.tracking.contour.samples import INVERSE_DEPTH, NX, NY, U, V
 from jawusd.tracking.contour.scan import CROWN, prepare_scan
 from jawusd.tracking.contour.solver import ContourSolver
@@ -159,6 +160,6 @@ def test_contours_are_sampled_while_threads_draw(monkeypatch):
     solver, poses = ContourSolver(SCANS, TrackingConfig()), jaw_poses(3)[2]
     rendering = solver.rendering([view])
     rendering.update(poses)
-    monkeypatch.setattr(Contour, "samples", None)
+    monkeypatch.setattr(rendering_module, "contour_samples", None)
     samples, silhouettes = rendering.samples(solver.contours[0], 0, 0, poses[0])
     assert 0 < silhouettes <= len(samples)

@@ -12,7 +12,7 @@ from jawusd.geometry import make_transform, rigidity_defect, se3_exp, se3_invers
 from jawusd.meshes.raster import draw_depth_labels, project
 from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.contour.correspondences import accumulate, search_edges
-from jawusd.tracking.contour.equations import GingivalMarginTerm, NormalEquations, SilhouetteTerm
+from jawusd.tracking.contour.equations import NormalEquations, OutlineTerm
 from jawusd.tracking.contour.samples import (
     COLUMNS,
     CROWN,
@@ -257,7 +257,7 @@ def test_excluded_masks_have_no_effect():
 def test_silhouette_and_gingival_margin_are_separate_terms():
     solution = ContourSolver(SCANS, CONFIG).solve(POSES[2], _views(2), ())
     equations, parts = NormalEquations(), []
-    for term in (SilhouetteTerm(), GingivalMarginTerm()):
+    for term in (OutlineTerm(False), OutlineTerm(True)):
         before = equations.matrix.copy()
         term.accumulate(solution, equations)
         parts.append(np.trace(equations.matrix - before))

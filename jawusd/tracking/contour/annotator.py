@@ -1,8 +1,7 @@
 """Annotator bias: offsets between mask outlines and tooth edges that all frames of a take share.
 
-The bias of a mask has three components, as in `OutlineSums`: outward at tooth edges and at the gum line [px at working
-resolution], and along the crown surface at the gum line [mm]. It is a sum of layers: the bias common to all masks of a
-take, its deviations in each arch, and its deviations in each arch and camera.
+The bias of a mask, with the components of `OutlineSums`, is the sum of the bias common to all masks of a take, its
+deviations in each arch, and its deviations in each arch and camera.
 """
 
 from __future__ import annotations
@@ -21,19 +20,13 @@ COMPONENTS = 3
 
 @dataclass(frozen=True)
 class AnnotatorPrior:
-    """Prior standard deviations of mask biases, per component: tooth edges [px], gum line [px], gum line [mm].
+    """Prior standard deviations of mask biases, per component: tooth edges [px], gum line [px], gum line [mm]."""
 
-    Attributes:
-        common: bias of all masks; the second component is the bias of the gum line relative to tooth edges.
-        arch: deviations in each arch.
-        camera: deviations in each arch and camera [px]; tooth edges and gum line only.
-        frames: effective number of independent frames in a take [-]: few, since all frames show the same lips and
-            teeth.
-    """
-
+    #: bias of all masks; the second component is the bias of the gum line relative to tooth edges
     common: tuple[float, float, float]
-    arch: tuple[float, float, float]
-    camera: tuple[float, float]
+    arch: tuple[float, float, float]  # deviations in each arch
+    camera: tuple[float, float]  # deviations in each arch and camera [px]; tooth edges and gum line only
+    #: effective number of independent frames in a take [-]: few, since all frames show the same lips and teeth
     frames: float
 
     def sigma(self, cameras: int) -> Array:

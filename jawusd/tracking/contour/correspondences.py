@@ -1,7 +1,4 @@
-"""Match contour samples with mask edges along their normals, and accumulate the normal equations.
-
-The compiled functions release the GIL and are stateless.
-"""
+"""Match contour samples with mask edges along their normals, and accumulate the normal equations."""
 
 from __future__ import annotations
 
@@ -57,8 +54,7 @@ def _at(picture: NDArray[np.float32], x: float, y: float) -> float:
 def _nearest_edge(mask: NDArray[np.uint8], x: float, y: float, nx: float, ny: float, reach: float) -> float:
     """Return the signed distance [px] along the normal to the nearest edge where the mask ends.
 
-    The distance is NaN if there is no edge within reach, and positive infinity if the mask extends over the whole
-    reach.
+    It is NaN without an edge within reach, and positive infinity if the mask extends over the whole reach.
     """
     start = _sample(mask, x, y)
     outer = inner = start
@@ -159,25 +155,21 @@ def accumulate(
     habit_distance: Array,
     habit_weight: Array,
 ) -> tuple[float, float, float, float]:
-    """Add the Tukey-weighted normal equations of one arch in one view.
+    """Add the Tukey-weighted normal equations of one arch in one view; return four sums of `OutlineSums`.
 
     The residual d of a sample with image normal n decreases by n . du if the sample moves by du in the image; du is
-    caused by a left twist (omega, v) of the arch about `centre` (Drummond & Cipolla 2002 use the same point-to-edge
-    distances).
+    caused by a left twist (omega, v) of the arch about `centre` (Drummond & Cipolla 2002 use the same distances).
 
     Args:
         samples, distances: input and output of `search_edges`, shapes (n, COLUMNS) and (n,).
-        gate_px: residual above which the Tukey weight is zero.
-        score_gate_px: residual above which a sample adds nothing to the score.
+        gate_px, score_gate_px: residuals above which the Tukey weight and the contribution to the score are zero.
         pull: weight, at the gate, of samples deep inside the mask; 0 ignores these samples.
-        pose: scan to world, shape (4, 4).
-        matrix: world [mm] to homogeneous px, shape (3, 4).
+        pose, matrix: scan to world, shape (4, 4); world [mm] to homogeneous px, shape (3, 4).
         centre: centre of the twist in world coordinates [mm], shape (3,).
-        precision, gradient: incremented, shapes (6, 6) and (6,); see `OutlineSums`.
-        habit_slope, habit_distance, habit_weight: incremented, shapes (K, 6), (K,), (K, K).
+        precision, gradient, habit_slope, habit_distance, habit_weight: incremented; see `OutlineSums`.
 
     Returns:
-        The sums weight, square, matched_px and score_px of `OutlineSums`.
+        weight, square, matched_px and score_px.
     """
     sum_weight = sum_square = matched_px = score_px = 0.0
     jacobian = np.empty(6)
@@ -235,11 +227,9 @@ def accumulate_outline(
 
     Args:
         r, c: arch and view; the sums must be zero there.
-        samples, distances: as for `accumulate`.
-        silhouettes: number of silhouette samples, which come first.
+        samples, distances: as for `accumulate`; the first `silhouettes` samples are those of the silhouette.
         limits: gate, score gate and pull, as for `accumulate`.
         where: pose, matrix and centre, as for `accumulate`.
-        silhouette, margin: results, the sums over both kinds of samples.
     """
     for k in range(2):
         sums = silhouette if k == 0 else margin
@@ -266,8 +256,7 @@ def scatter_of_tiles(
 ) -> tuple[Array, Array]:
     """Return the sum of s s^T over image tiles, shape (6, 6), where s is the sum of w J d over the samples in a tile.
 
-    The second result uses the gum fraction instead of d: the effect of a gum line that is one pixel off in each tile,
-    independently of other tiles.
+    The second result uses the gum fraction instead of d: the effect of a gum line that is one pixel off in each tile.
 
     Outline errors are correlated along the contour, so they are summed within a tile before they are squared. The ratio
     of the result to the normal matrix gives the correlation length (cluster-robust covariance, Liang & Zeger 1986).

@@ -1,8 +1,7 @@
 """The normal equations of one Gauss-Newton step, and the residual terms that contribute to them.
 
 The unknowns are the left twists (omega [rad], v [mm]) of both arches about their centres. Each constraint on the two
-poses is a `ResidualTerm`: mask outlines, the prior at the start pose, and the jaw model. To add a kind of measurement,
-write a class with `accumulate` and pass it to `ContourSolver.solve`.
+poses is a `ResidualTerm`, passed to `ContourSolver.solve`.
 """
 
 from __future__ import annotations
@@ -39,28 +38,18 @@ class OutlineSums(NamedTuple):
     """Sums over matched contour samples per arch and view: weight w, distance d to the mask edge [px], derivative J.
 
     Annotator bias has three components: at tooth edges [px], at the gum line in the image [px], and at the gum line
-    along the crown surface [mm]. It shifts the outline by their scalar product with h, the last three columns of a
-    sample.
-
-    Attributes:
-        precision: sum w J^T J, shape (2, C, 6, 6).
-        gradient: sum w J d, shape (2, C, 6).
-        habit_slope: sum w h J, which couples poses with mask biases, shape (2, C, 3, 6).
-        habit_distance, habit_weight: sum w h d and sum w h h^T, shapes (2, C, 3) and (2, C, 3, 3).
-        weight, square: sum w and sum w d^2, shape (2, C).
-        matched_px: contour length with residuals within the gate, shape (2, C).
-        score_px: contour length weighted by 1 minus Tukey's loss at the score gate, shape (2, C).
+    along the crown surface [mm]. It shifts the outline by their scalar product with h, the last columns of a sample.
     """
 
-    precision: Array
-    gradient: Array
-    habit_slope: Array
-    habit_distance: Array
-    habit_weight: Array
-    weight: Array
-    square: Array
-    matched_px: Array
-    score_px: Array
+    precision: Array  # sum w J^T J, shape (2, C, 6, 6)
+    gradient: Array  # sum w J d, shape (2, C, 6)
+    habit_slope: Array  # sum w h J, which couples poses with mask biases, shape (2, C, 3, 6)
+    habit_distance: Array  # sum w h d, shape (2, C, 3)
+    habit_weight: Array  # sum w h h^T, shape (2, C, 3, 3)
+    weight: Array  # sum w, shape (2, C)
+    square: Array  # sum w d^2, shape (2, C)
+    matched_px: Array  # contour length with residuals within the gate, shape (2, C)
+    score_px: Array  # contour length weighted by 1 minus Tukey's loss at the score gate, shape (2, C)
 
     @classmethod
     def zeros(cls, cameras: int) -> OutlineSums:
@@ -93,12 +82,10 @@ class Solution:
 
 
 class NormalEquations:
-    """Normal equations of both arches' twists, in named blocks.
+    """Normal equations of both arches' twists.
 
     Attributes:
-        matrix: precision matrix with the arches in the order (upper, lower), shape (12, 12); `upper`, `lower` and
-            `coupling` are views of its blocks.
-        right: right-hand side, shape (12,).
+        matrix, right: precision (12, 12) and right-hand side (12,), with the upper arch first.
         outline_weight: weight of the outline sums per arch [1/px^3], shape (2,): 1, or 1 / (outline variance times
             correlation length) if other terms are log-likelihoods.
     """
@@ -107,25 +94,11 @@ class NormalEquations:
         self.matrix, self.right = np.zeros((12, 12)), np.zeros(12)
         self.outline_weight = np.ones(2) if outline_weight is None else outline_weight
 
-    @property
-    def upper(self) -> Array:
-        """The precision of the upper arch, shape (6, 6)."""
-        return self.matrix[:6, :6]
-
-    @property
-    def lower(self) -> Array:
-        """The precision of the lower arch, shape (6, 6)."""
-        return self.matrix[6:, 6:]
-
-    @property
-    def coupling(self) -> Array:
-        """The precision that couples the upper arch (rows) and the lower arch (columns), shape (6, 6)."""
-        return self.matrix[:6, 6:]
-
     def add(self, arch: int, precision: Array, right: Array) -> None:
         """Add the precision (6, 6) and right-hand side (6,) of a constraint on one arch."""
-        (self.upper, self.lower)[arch][:] += precision
-        self.right[6 * arch : 6 * arch + 6] += right
+        own = slice(6 * arch, 6 * arch + 6)
+        self.matrix[own, own] += precision
+        self.right[own] += right
 
     def add_joint(self, precision: Array, right: Array) -> None:
         """Add the precision (12, 12) and right-hand side (12,) of a joint constraint on both arches."""
@@ -145,25 +118,17 @@ class ResidualTerm(Protocol):
         ...
 
 
-class SilhouetteTerm:
-    """Penalises the distances of crown silhouettes from the edges of their masks."""
+@dataclass(frozen=True)
+class OutlineTerm:
+    """Penalises the distances of crown silhouettes, or of crown-gum lines, from the edges of their masks."""
+
+    of_gum: bool
 
     def accumulate(self, state: Solution, equations: NormalEquations) -> None:
-        """Add the sums over the matched silhouette samples of all views."""
-        _add_outline(state.silhouette, equations)
-
-
-class GingivalMarginTerm:
-    """Penalises the distances of crown-gum lines from the edges of their masks."""
-
-    def accumulate(self, state: Solution, equations: NormalEquations) -> None:
-        """Add the sums over the matched samples of the gingival margin of all views."""
-        _add_outline(state.gingival_margin, equations)
-
-
-def _add_outline(sums: OutlineSums, equations: NormalEquations) -> None:
-    for arch, weight in enumerate(equations.outline_weight):
-        equations.add(arch, weight * sums.precision[arch].sum(0), weight * sums.gradient[arch].sum(0))
+        """Add the sums over the matched samples of all views."""
+        sums = state.gingival_margin if self.of_gum else state.silhouette
+        for arch, weight in enumerate(equations.outline_weight):
+            equations.add(arch, weight * sums.precision[arch].sum(0), weight * sums.gradient[arch].sum(0))
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,9 +5,8 @@ from __future__ import annotations
 import math
 import tempfile
 import weakref
-from collections.abc import Iterable, Iterator, Mapping, MutableMapping
+from collections.abc import Iterable, Iterator, Mapping, MutableMapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -49,7 +48,7 @@ class FrameRecord:
 
     @property
     def uncertain(self) -> bool:
-        """Whether less of the contour fits than usual: never, since arches that fit less than usual are lost."""
+        """Whether less of the contour fits than usual: never, since such arches are lost."""
         return False
 
 
@@ -60,21 +59,14 @@ def whole_frames(records: Mapping[int, FrameRecord]) -> list[int]:
 
 @dataclass(frozen=True, eq=False)
 class FrameSummary:
-    """The part of a frame's result that later frames need.
+    """The part of a frame's result that later frames need."""
 
-    Attributes:
-        poses: T_world_upper and T_world_lower, shape (2, 4, 4).
-        status, used, coverage: as in `FrameRecord`.
-        score_px: length of matched contour per arch and view [px], shape (2, C).
-        residual_px: standard deviation of the residuals per arch, shape (2,).
-    """
-
-    poses: Array
-    status: NDArray[np.int8]
+    poses: Array  # T_world_upper and T_world_lower, shape (2, 4, 4)
+    status: NDArray[np.int8]  # this and the next two fields: as in `FrameRecord`
     used: Mask
     coverage: Array
-    score_px: Array
-    residual_px: Array
+    score_px: Array  # length of matched contour per arch and view [px], shape (2, C)
+    residual_px: Array  # standard deviation of the residuals per arch, shape (2,)
 
     @classmethod
     def of(cls, record: FrameRecord) -> FrameSummary:
@@ -96,8 +88,8 @@ _MIRROR[_LOWER] = _MIRROR[_LOWER[::-1]] = np.arange(len(_LOWER[0]))
 class PackedRecords(MutableMapping[int, FrameRecord]):
     """A mapping of frames to records, which are packed into a temporary file so that long takes need little memory.
 
-    Poses and quality figures keep double precision. Sums over samples are stored in single precision, which suffices
-    for thousands of distances accurate to 0.01 px. Not thread-safe.
+    Only sums over samples are stored in single precision, which suffices for thousands of distances accurate to
+    0.01 px. Not thread-safe.
     """
 
     def __init__(self) -> None:
@@ -147,11 +139,7 @@ class _Store:
         weakref.finalize(self, self._file.close)
 
     def add(self, figures: Array, sums: NDArray[np.float32]) -> int:
-        """Append a record; return its offset.
-
-        Raises:
-            OutputError: the temporary folder is full.
-        """
+        """Append a record; return its offset. Raises OutputError if the temporary folder is full."""
         place = self._end
         try:
             self._file.seek(place)
@@ -192,10 +180,11 @@ def _unpacked(figures: Array, sums: NDArray[np.float32]) -> FrameRecord:
     # Poses, centres, status, losses and iterations have fixed sizes; the other three arrays have one entry per arch and
     # view.
     views = (len(figures) - 2 * 16 - 2 * 3 - 2 - 2 * 3 - 1) // (2 * 3)
-    of_figures, of_sums = _places(views)
-    poses, centres, visible, status, used, coverage, losses, iterations = _split(figures, of_figures)
-    parts = _split(sums.astype(np.float64), of_sums)
-    count = len(_SUM_SHAPES)
+    shapes = ((2, 4, 4), (2, 3), (2, views), (2,), (2, views), (2, views), (2, 3), (1,))
+    poses, centres, visible, status, used, coverage, losses, iterations = _split(figures, shapes)
+    half, count = (len(_LOWER[0]),), len(_SUM_SHAPES)
+    of_views = [(2, views, *shape) for shape in (half, *_SUM_SHAPES[1:])]
+    parts = _split(sums.astype(np.float64), (*of_views, *of_views, (2, *half), (2, *half)))
     silhouette, margin = (OutlineSums(parts[k][..., _MIRROR], *parts[k + 1 : k + count]) for k in (0, count))
     scatters, gum_scatters = (part[:, _MIRROR] for part in parts[-2:])
     solution = Solution(poses, silhouette, margin, centres, scatters, gum_scatters, visible, int(iterations[0]))
@@ -207,25 +196,7 @@ def _joined(arrays: Iterable[ArrayLike]) -> Array:
     return np.concatenate([np.asarray(array, np.float64).ravel() for array in arrays])
 
 
-_Places = list[tuple["slice[int, int, int]", tuple[int, ...]]]
-
-
-@lru_cache(maxsize=8)
-def _places(views: int) -> tuple[_Places, _Places]:
-    """Return slices and shapes of the arrays in a packed record: quality figures, then sums over samples."""
-    half = (len(_LOWER[0]),)
-    figures = ((2, 4, 4), (2, 3), (2, views), (2,), (2, views), (2, views), (2, 3), (1,))
-    sums = [(2, views, *shape) for shape in (half, *_SUM_SHAPES[1:])]
-    return _in_a_row(figures), _in_a_row((*sums, *sums, (2, *half), (2, *half)))
-
-
-def _in_a_row(shapes: Iterable[tuple[int, ...]]) -> _Places:
-    out, end = [], 0
-    for shape in shapes:
-        start, end = end, end + math.prod(shape)
-        out.append((slice(start, end, 1), shape))
-    return out
-
-
-def _split(flat: Array, places: _Places) -> list[Array]:
-    return [flat[part].reshape(shape) for part, shape in places]
+def _split(flat: Array, shapes: Sequence[tuple[int, ...]]) -> list[Array]:
+    """Return the successive parts of a flat array, in the given shapes."""
+    ends = np.cumsum([math.prod(shape) for shape in shapes])
+    return [part.reshape(shape) for part, shape in zip(np.split(flat, ends[:-1]), shapes, strict=True)]

@@ -1,7 +1,6 @@
 """The crown-gum line of a scan as 3-D segments, for scans in which crowns continue below the gum surface.
 
-Painted scans often contain whole crowns that dip into a separate gum surface. The visible border is then the curve
-in which the two surfaces intersect, which is not an edge of either mesh.
+The visible border is then the curve in which the two surfaces intersect, which is not an edge of either mesh.
 """
 
 from __future__ import annotations

@@ -15,8 +15,7 @@ from jawusd.tracking.contour.equations import NormalEquations, ResidualTerm, Sol
 from jawusd.tracking.contour.scan import ARCHES, Scan
 from jawusd.tracking.contour.views import View
 
-# Standard deviation of the part of the gum-line error that differs from tooth to tooth [px].
-_GUM_BY_TOOTH_PX = 0.3
+_GUM_BY_TOOTH_PX = 0.3  # standard deviation of the part of the gum-line error that differs from tooth to tooth [px]
 # Variance E[w d^2] / E[w] of a standard normal residual d with Tukey weight w (gate of 4.685 standard deviations),
 # computed by quadrature.
 _TUKEY_VARIANCE = 0.828
@@ -58,7 +57,7 @@ def uncovered_px(
 ) -> tuple[Array, Array]:
     """Return the number of mask pixels not covered by projected crowns (E_SP in eq. 8 of the paper), and of all pixels.
 
-    Both have a value per arch and view, shape (2, C).
+    Both have shape (2, C).
     """
     uncovered, total = np.zeros((2, len(views))), np.zeros((2, len(views)))
 
@@ -97,18 +96,16 @@ def arch_fit(scans: Sequence[Scan], solution: Solution, views: Sequence[View], u
 def twist_covariance(solution: Solution, arch: int, sigma_px: float, correlation_px: float) -> Array:
     """Return the covariance of an arch's left twist about the world origin, sigma^2 l H^-1, shape (6, 6).
 
-    Args:
-        arch: 0 upper, 1 lower.
-        sigma_px: standard deviation of the outline error.
-        correlation_px: correlation length l of outline errors along the contour: n pixels of contour contain n / l
-            independent measurements.
-
     The diagonal is infinite if the masks leave a motion unconstrained.
+
+    Args:
+        sigma_px: standard deviation of the outline error.
+        correlation_px: correlation length l of outline errors: n pixels of contour contain n / l independent
+            measurements.
     """
     H = solution.outline.precision[arch].sum(0)
-    free = np.diag(np.full(6, np.inf))
     if not np.isfinite(sigma_px) or np.linalg.matrix_rank(H, hermitian=True) < 6:
-        return free
+        return np.diag(np.full(6, np.inf))
     A = se3_adjoint(translation(solution.centres[arch]))
     inverse = np.linalg.inv(H)
     gum = _GUM_BY_TOOTH_PX**2 * inverse @ solution.gum_scatters[arch] @ inverse
@@ -118,11 +115,8 @@ def twist_covariance(solution: Solution, arch: int, sigma_px: float, correlation
 def joint_covariance(solution: Solution, prior: ResidualTerm, sigma_px: Array, correlation_px: float) -> Array | None:
     """Return the covariance of both arches' left twists about the world origin given masks and prior, shape (12, 12).
 
-    Return None if masks and prior leave a motion unconstrained.
-
-    Args:
-        prior: a further constraint on the two poses; a log-likelihood.
-        sigma_px, correlation_px: as for `twist_covariance`; `sigma_px` per arch, shape (2,).
+    Return None if masks and prior, a log-likelihood, leave a motion unconstrained. `sigma_px`, shape (2,), and
+    `correlation_px` are as for `twist_covariance`.
     """
     equations = NormalEquations()
     prior.accumulate(replace(solution, centres=np.zeros((2, 3))), equations)

@@ -32,13 +32,6 @@ class Contour:
     depth_tolerance_mm: float
     towards_gum: Array | None
 
-    def samples(
-        self, matrix: Array, eye: Array, labels: NDArray[np.uint8], inverse_depth: NDArray[np.float32]
-    ) -> tuple[Array, int]:
-        """Return the contour samples in a rendering of the scan; arguments and result as for `contour_samples`."""
-        limits = (self.step_px, self.depth_tolerance_mm)
-        return contour_samples(self.scan, matrix, eye, labels, inverse_depth, *limits, self.towards_gum)
-
 
 class Drawing:
     """A rendering of a scan for one camera; for small motions, it is warped instead of rendered again.
@@ -47,13 +40,11 @@ class Drawing:
     """
 
     def __init__(self, scan: Scan, matrix: Array, eye: Array, shape: tuple[int, int]) -> None:
-        """Render the scan.
+        """Render the scan in a window of size `shape` (h, w).
 
         Args:
-            scan: the scan of one arch.
             matrix: projection from scan coordinates [mm] to homogeneous px of a window, shape (3, 4).
             eye: camera centre in scan coordinates [mm], shape (3,).
-            shape: size (h, w) of the window.
         """
         self._scan, self._eye = scan, eye
         self._matrix = _shifted(matrix, _AROUND_PX)
@@ -68,11 +59,9 @@ class Drawing:
         self._least_squares = np.linalg.pinv(drawn_at)
 
     def shows(self, matrix: Array, eye: Array, shape: tuple[int, int], parallax_px: float) -> bool:
-        """Return whether this drawing can be warped to another pose.
+        """Return whether this drawing can be warped to another pose; arguments are as for the constructor.
 
-        Args:
-            matrix, eye, shape: as for the constructor.
-            parallax_px: maximum relative motion of near and far parts.
+        `parallax_px` is the maximum relative motion of near and far parts.
         """
         centre, radius_mm = self._scan.centre, self._scan.radius_mm
         before, now = self._eye - centre, eye - centre
@@ -98,12 +87,7 @@ class Drawing:
         return np.column_stack([back, -back @ shift])
 
     def show(self, matrix: Array, labels: NDArray[np.uint8], inverse_depth: NDArray[np.float32]) -> float:
-        """Write the drawing warped to a pose; return the rotation of the scan in the image [rad].
-
-        Args:
-            matrix: as for the constructor.
-            labels, inverse_depth: receive the label and the inverse depth [1/mm] of every pixel of the window.
-        """
+        """Write labels and inverse depths [1/mm] at a pose; return the rotation of the scan in the image [rad]."""
         if (_shifted(matrix, _AROUND_PX) == self._matrix).all():  # the pose is unchanged, but the window may be smaller
             window = tuple(slice(_AROUND_PX, _AROUND_PX + side) for side in labels.shape)
             labels[:], inverse_depth[:] = self._labels[window], self._inverse_depth[window]
@@ -118,18 +102,14 @@ class Drawing:
     def find_samples(self, contour: Contour) -> None:
         """Sample a contour in this drawing unless its samples are cached."""
         if contour not in self._contours:
-            self._contours[contour] = contour.samples(self._matrix, self._eye, self._labels, self._inverse_depth)
+            drawn = (self._matrix, self._eye, self._labels, self._inverse_depth)
+            limits = (contour.step_px, contour.depth_tolerance_mm)
+            self._contours[contour] = contour_samples(contour.scan, *drawn, *limits, contour.towards_gum)
 
     def samples(self, contour: Contour, matrix: Array, shape: tuple[int, int], turned_rad: float) -> _Kept:
-        """Return the samples of a contour at a pose close to that of the last call of `show`.
+        """Return a copy of the samples of a contour, which may have more faces, close to the pose of the last `show`.
 
-        Args:
-            contour: contour of this arch; the drawing may be of a scan with fewer faces.
-            matrix, shape: as for the constructor, at that pose.
-            turned_rad: result of `show`.
-
-        Returns:
-            A copy of the samples, as returned by `contour_samples`.
+        `matrix` and `shape` are those of the pose, as for the constructor; `turned_rad` is the result of `show`.
         """
         self.find_samples(contour)
         kept = self._contours[contour]
@@ -149,17 +129,13 @@ class Drawings:
     def of(
         self, arch: int, view: int, camera: Array, T_world_scan: Array, matrix: Array, shape: tuple[int, int]
     ) -> Drawing:
-        """Return a drawing that can be warped to a pose of an arch.
-
-        Thread-safe for different arches or views.
+        """Return a drawing that can be warped to a pose of an arch; thread-safe for different arches or views.
 
         Args:
-            arch: 0 upper, 1 lower.
-            view: index of the view.
+            arch, view: 0 upper, 1 lower; index of the view.
             camera: camera centre in world coordinates [mm], shape (3,).
             T_world_scan: the pose, shape (4, 4).
-            matrix: projection from scan coordinates [mm] to homogeneous px of the window, shape (3, 4).
-            shape: size (h, w) of the window.
+            matrix, shape: as for `Drawing`.
         """
         eye = T_world_scan[:3, :3].T @ (camera - T_world_scan[:3, 3])
         key = (arch, view, camera.tobytes())
@@ -184,8 +160,7 @@ def _moved(
 ) -> tuple[int, int]:
     """Move samples to another pose and write those that lie in the window, silhouettes first.
 
-    Returns:
-        The number of samples written, and the number of silhouette samples among them.
+    Return the number of samples written, and the number of silhouette samples among them.
     """
     n, first = 0, 0
     for s in range(len(samples)):
@@ -233,8 +208,7 @@ _CORNERS = np.array([[1.0, 0, 0], [0, 1, 0], [0, 0, 1], [-1, 0, 0], [0, 0, -1]])
 class Rendering:
     """Renderings and contours of both scans in every view of one frame, rendered again only after the scans have moved.
 
-    Between renderings, the points of a contour move with the scan. The true contour of a rotated scan runs through
-    other points; the error is of second order.
+    Between renderings, the points of a contour move with the scan; for a rotated scan, the error is of second order.
     """
 
     def __init__(
@@ -243,7 +217,6 @@ class Rendering:
         """Start without drawings.
 
         Args:
-            views: the views of the frame.
             contours: contours of the upper and lower arch, sampled while drawing.
             drawings: cache shared between frames.
             redraw_px: image motion after which an arch is rendered again.
@@ -269,16 +242,7 @@ class Rendering:
         list(self._map(show, tasks))
 
     def samples(self, contour: Contour, r: int, c: int, pose: Array) -> tuple[Array, int]:
-        """Return the samples of a contour in a view, warped to a pose close to the rendered one.
-
-        Args:
-            contour: contour of the arch; the drawing may be of a scan with fewer faces.
-            r, c: arch and view.
-            pose: T_world_arch at the view's exposure, shape (4, 4).
-
-        Returns:
-            A copy of the samples, as returned by `contour_samples`.
-        """
+        """Return a copy of a contour's samples in a view, warped to a pose (4, 4) at the view's exposure."""
         _, drawing, turned_rad = self._shown[r, c]
         view = self._views[c]
         return drawing.samples(contour, view.matrix @ pose, view.masks.shape[1:], turned_rad)

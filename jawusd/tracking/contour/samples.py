@@ -1,7 +1,4 @@
-"""Points on the visible contour of a projected scan: silhouette edges, scan borders and the gingival margin.
-
-The compiled functions release the GIL and are stateless.
-"""
+"""Points on the visible contour of a projected scan: silhouette edges, scan borders and the gingival margin."""
 
 from __future__ import annotations
 
@@ -44,25 +41,21 @@ def contour_samples(
 ) -> tuple[Array, int]:
     """Return the contour points at which the label changes from crown to another one, shape (n, COLUMNS).
 
-    Silhouette samples come first, then those of the gingival margin; the second result is the number of silhouette
-    samples.
+    Silhouette samples come first; the second result is their number.
 
     Args:
         matrix: projection from scan coordinates [mm] to homogeneous px of the region, shape (3, 4).
         eye: camera centre in scan coordinates [mm], shape (3,).
-        labels: visible label of every pixel of the region: CROWN, GUM or 0, shape (h, w).
-        inverse_depth: inverse depth [1/mm], shape (h, w).
+        labels, inverse_depth: visible label (CROWN, GUM or 0) and inverse depth [1/mm] of every pixel, shape (h, w).
         step_px: maximum distance between samples.
-        depth_tolerance_mm: maximum decrease in depth from a contour point to the surface just inside it; beyond that,
-            the surface hides the point.
-        towards_gum: unit vector in scan coordinates, shape (3,), for scans without gum: outlines facing this direction
-            are gum line.
+        depth_tolerance_mm: maximum decrease in depth from a contour point to the surface just inside it, which
+            otherwise hides the point.
+        towards_gum: for scans without gum, unit vector (3,) in scan coordinates: outlines facing this way are gum line.
     """
     gum = np.zeros(3) if towards_gum is None else towards_gum
     tables = (scan.vertices, scan.crown_faces, scan.planes, scan.edges, scan.gingival_margin, scan.margin_directions)
-    samples, count = _samples(
-        *tables, scan.centre, eye, matrix, labels, inverse_depth, step_px, depth_tolerance_mm, gum
-    )
+    where = (scan.centre, eye, matrix, labels, inverse_depth)
+    samples, count = _samples(*tables, *where, step_px, depth_tolerance_mm, gum)
     return samples, count
 
 
@@ -254,8 +247,8 @@ def _visible(
 def _outermost(samples: Array, shape: tuple[int, int]) -> Array:
     """Drop samples that lie inside the outline by less than one pixel, which is the resolution of `_visible`.
 
-    At a rounded edge with small or noisy faces, several silhouette lines can lie within a pixel. Only the outermost one
-    is the outline; the others would bias the outline inwards by 0.03 to 0.05 px.
+    At an edge with small or noisy faces, several silhouette lines can lie within a pixel. Only the outermost one is the
+    outline; the others would bias it inwards by 0.03 to 0.05 px.
     """
     rows, columns = int(shape[0] / _BESIDE_PX) + 3, int(shape[1] / _BESIDE_PX) + 3
     last = np.full((rows, columns), -1, np.int32)  # index of the last sample in every cell

@@ -48,8 +48,7 @@ class Scan:
     gingival_margin: Array  # segments of the crown-gum line that are not mesh edges [mm], shape (S, 2, 3)
     margin_directions: Array  # unit vectors on the crown surface across these segments, shape (S, 3)
     probes: Array  # vertices spread over the crowns, at which motion is measured [mm], shape (N <= 300, 3)
-    # centroid of the crown vertices [mm], shape (3,)
-    centre: Array
+    centre: Array  # centroid of the crown vertices [mm], shape (3,)
     radius_mm: float  # maximum distance of a crown vertex from `centre` [mm]
     # whether labels or paint separate crown from gum (back faces of separated crowns are culled); otherwise the whole
     # scan counts as crown
@@ -70,9 +69,8 @@ class Scan:
     def silhouette(self, matrix: Array, shape: tuple[int, int], left: int = 0, top: int = 0) -> NDArray[np.uint64]:
         """Return the pixels covered by the crowns in an image of size (h, w), as packed bits.
 
-        Args:
-            matrix: projection from scan coordinates [mm] to homogeneous px, shape (3, 4).
-            left, top: pixel coordinates of the image's first column and row.
+        `matrix` is the projection from scan coordinates [mm] to homogeneous px, shape (3, 4); `left` and `top` are the
+        pixel coordinates of the image's first column and row.
         """
         bits = np.zeros((shape[0], words_for(shape[1])), np.uint64)
         draw_silhouette(self._projected(matrix), self.crown_faces, left, top, shape[1], self.painted, bits)
@@ -103,15 +101,15 @@ def teeth_centre(scans: Sequence[Scan], poses: Array) -> Array:
 def prepare_scan(mesh: Mesh, name: str) -> Scan:
     """Split a teeth scan into crowns and gum and build the tables of the contour search.
 
-    Args:
-        mesh: the teeth scan. Crowns are found from its labels, otherwise from its paint (see
-            `formats.mesh.tooth_labels`); without labels and paint, the whole scan counts as crown.
-        name: "upper" or "lower", for messages.
+    Without labels and paint (see `formats.mesh.tooth_labels`), the whole scan counts as crown. `name` is "upper" or
+    "lower", for messages.
 
     Raises:
         TrackingError: the scan has too few faces to be tracked.
     """
-    vertices, faces = _weld(np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int32))
+    # In a triangle soup, every edge would be a border, so coincident vertices are merged.
+    vertices, index = welded(np.asarray(mesh.vertices, np.float64))
+    faces = np.ascontiguousarray(index[np.asarray(mesh.faces, np.int32)], np.int32)
     painted = not (tooth_labels(mesh) > 0).all()
     crown = crown_face_mask(mesh)
     solid = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
@@ -147,13 +145,7 @@ def mirrored(scan: Scan, point: Array, normal: Array) -> Scan:
     return _with_tables(scan.name, vertices, crown, gum, scan.painted)
 
 
-def _with_tables(
-    name: str,
-    vertices: Array,
-    crown_faces: Faces,
-    gum_faces: Faces,
-    painted: bool,
-) -> Scan:
+def _with_tables(name: str, vertices: Array, crown_faces: Faces, gum_faces: Faces, painted: bool) -> Scan:
     """Return the scan with the tables of the contour search."""
     corner = vertices[crown_faces]
     normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
@@ -177,17 +169,8 @@ def _with_tables(
     )
 
 
-def _weld(vertices: Array, faces: Faces) -> tuple[Array, Faces]:
-    """Merge coincident vertices: in a triangle soup, every edge would otherwise be a border."""
-    places, index = welded(vertices)
-    return places, np.ascontiguousarray(index[faces], np.int32)
-
-
 def _wound_outwards(vertices: Array, faces: Faces) -> Faces:
-    """Return the faces, with connected components of negative volume flipped.
-
-    Volumes are taken about each component's own centre, so the missing base of a crown changes them little.
-    """
+    """Return the faces, with connected components of negative volume, about their own centres, flipped."""
     links = coo_array(
         (np.ones(3 * len(faces)), (faces.ravel(), np.roll(faces, 1, axis=1).ravel())), [len(vertices)] * 2
     )

@@ -8,20 +8,19 @@ from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Executor, wait
 from dataclasses import replace
 from functools import cached_property
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import numpy as np
 
 from jawusd.base.arrays import Array, Mask
 from jawusd.geometry import bite_normal, orthonormalise, transform_point
-from jawusd.tracking.config import Mapper, TrackingConfig
+from jawusd.tracking.config import Item, Mapper, Result, TrackingConfig
 from jawusd.tracking.contour.correspondences import accumulate_outline, scatter_of_tiles, search_edges
 from jawusd.tracking.contour.equations import (
-    GingivalMarginTerm,
     NormalEquations,
     OutlineSums,
+    OutlineTerm,
     ResidualTerm,
-    SilhouetteTerm,
     Solution,
     StartTerm,
     motion_about,
@@ -105,7 +104,6 @@ class ContourSolver:
 
         Args:
             poses: start poses T_world_upper and T_world_lower, shape (2, 4, 4).
-            views: one view per camera.
             gates_px: residual gate of every iteration; if empty, the given poses are only evaluated.
             use: masks to use, shape (2, C); default: all present ones.
             terms: further constraints on the poses.
@@ -135,7 +133,7 @@ class ContourSolver:
         poses = np.array(poses, np.float64)
         rendering = rendering or self.rendering(views)
         pull = StartTerm(start, self._start_strength)
-        all_terms: tuple[ResidualTerm, ...] = (SilhouetteTerm(), GingivalMarginTerm(), pull, *terms)
+        all_terms: tuple[ResidualTerm, ...] = (OutlineTerm(False), OutlineTerm(True), pull, *terms)
         iterations, left = 0, tuple(gates_px)
         while left:
             iterations += 1
@@ -167,9 +165,8 @@ class ContourSolver:
 
         Args:
             poses: T_world_upper, T_world_lower, shape (2, 4, 4).
-            views, use: one view per camera, and the masks to use, shape (2, C).
+            use: masks to use, shape (2, C).
             gate: residual above which a sample has no weight [px].
-            rendering: rendering of these views, shared by all steps of a frame.
             final: whether to compute the sums for the covariance as well.
             matched: list to which the matched samples are appended.
         """
@@ -250,10 +247,6 @@ def _towards_gum(scans: Sequence[Scan]) -> list[Array | None]:
     return [None if gum else way * up for gum, way in zip(shown, (1.0, -1.0), strict=True)]
 
 
-_Item = TypeVar("_Item")
-_Result = TypeVar("_Result")
-
-
 class ParallelMap:
     """A parallel `map` for short tasks; it wakes one thread per core instead of one per item.
 
@@ -261,14 +254,13 @@ class ParallelMap:
     """
 
     def __init__(self, executor: Executor) -> None:
-        """Prepare the map to use the threads of an executor."""
         self._executor = executor
         self._more_threads = (os.cpu_count() or 1) - 1
 
-    def __call__(self, function: Callable[[_Item], _Result], items: Iterable[_Item], /) -> list[_Result]:
+    def __call__(self, function: Callable[[Item], Result], items: Iterable[Item], /) -> list[Result]:
         """Return the results in the order of the items; if a task fails, raise its error and start no further task."""
         left = deque(enumerate(items))
-        results: dict[int, _Result] = {}
+        results: dict[int, Result] = {}
 
         def work() -> None:
             while left:

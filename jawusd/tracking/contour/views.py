@@ -41,9 +41,9 @@ class EdgeSearch(Protocol):
     def search(
         self, samples: Array, count: int, arch: int, drawn: Drawn, limits: tuple[float, float, float]
     ) -> tuple[Array, Array]:
-        """Return the distance of each sample to its image edge [px], NaN without an edge, and its weight.
+        """Return the distance of each sample to its image edge [px], NaN without an edge, and its weight in 0 .. 1.
 
-        Weights are in 0 .. 1, NaN for samples hidden by the other arch.
+        Weights are NaN for samples hidden by the other arch.
 
         Args:
             samples: contour samples, shape (n, COLUMNS); the first `count` are on silhouettes.
@@ -75,8 +75,7 @@ class View:
     # outward mask bias: at tooth edges [px], at the gum line [px], and along the crown at the gum line [mm]; shape (2,
     # 3)
     habits: Array = field(default_factory=lambda: np.zeros((2, 3)))
-    # search for tooth borders by colour, which replaces the masks
-    edges: EdgeSearch | None = None
+    edges: EdgeSearch | None = None  # search for tooth borders by colour, which replaces the masks
 
 
 class MaskViews:
@@ -99,16 +98,12 @@ class MaskViews:
         """Open the masks and choose the working resolution.
 
         Args:
-            sources: all cameras of the capture.
-            cameras: calibrated cameras by name.
             offsets: time offset of every camera: the reference frame number minus its own frame number.
             centre_world: position of the teeth at the start [mm], shape (3,).
             working_px_per_mm: resolution at the teeth; images are never enlarged.
-            fewest: minimum number of cameras with masks.
 
         Raises:
-            TrackingError: fewer than `fewest` cameras have masks, or a camera is not calibrated or not synchronised.
-            CaptureError: masks are missing, corrupt, of the wrong size, or not masks.
+            TrackingError, CaptureError: as for `masked_sources`.
         """
         self._stack = ExitStack()
         self._masked = masked = masked_sources(sources, cameras, offsets, fewest)
@@ -145,23 +140,16 @@ class MaskViews:
         return out
 
     def at(self, frame: int) -> list[View]:
-        """Return the views of one frame of the reference camera.
-
-        Raises:
-            CaptureError: a mask cannot be decoded.
-        """
+        """Return the views of one frame of the reference camera; raises CaptureError if a mask cannot be decoded."""
         return [
             _view(working, [reader.read(frame - offset) for reader in pair])
             for working, offset, pair in zip(self._working, self._offsets, self._readers, strict=True)
         ]
 
     def around(self, frame: int, reach: int) -> list[list[View]]:
-        """Return the views of a frame and of up to `reach` frames before and after it, in order.
+        """Return the views of a frame and of up to `reach` frames before and after it, in order; raises as `at`.
 
         Masks are decoded once and in file order, since every jump reopens the files.
-
-        Raises:
-            CaptureError: a mask cannot be decoded.
         """
         first, stop = frame - reach, frame + reach + 1
         cameras = []
@@ -230,11 +218,7 @@ def masked_sources(
 
 
 def working_size(camera: Camera, centre_world: Array, px_per_mm: float) -> tuple[int, int]:
-    """Return the image size at which a world point has the desired resolution, at most the recorded size.
-
-    Raises:
-        TrackingError: the point lies behind the camera.
-    """
+    """Return the image size for a resolution at a world point; raises TrackingError if it is behind the camera."""
     depth = float(camera.depth(centre_world))
     if depth <= 0:
         raise TrackingError(
