@@ -34,8 +34,7 @@ from jawusd.rig import write_animation
 from jawusd.rig.rebake import write_over
 from jawusd.tracking.contour.scan import prepare_scan
 from jawusd.tracking.performance.results import tracks_of
-from jawusd.tracking.performance.shot import solve_capture
-from jawusd.tracking.performance.skin_alone import solve_by_skin
+from jawusd.tracking.performance.shot import solve_by_skin, solve_capture
 
 SUFFIXES = (".csv", ".npz", ".usdc", ".usda")
 _USD = (".usd", ".usda", ".usdc", ".usdz")

@@ -24,8 +24,7 @@ from jawusd.geometry import (
 )
 from jawusd.tracking.contour.annotator import DRAWN, AnnotatorPrior
 from jawusd.tracking.performance.coordinates import HEAD, JAW, LOCAL, OPENING, Coordinates, Pose
-from jawusd.tracking.performance.instant import CLOSED_MM, bound_equations, rig_gain
-from jawusd.tracking.performance.misfit import Misfit
+from jawusd.tracking.performance.instant import CLOSED_MM, Misfit, bound_equations, rig_gain
 from jawusd.tracking.performance.motion import measured_motion
 from jawusd.tracking.performance.results import tracks_of
 from jawusd.tracking.performance.system import TakeSystem

@@ -12,8 +12,8 @@ from jawusd.formats.tracks import LOST, load_tracks, save_tracks
 from jawusd.tracking.contour.scan import prepare_scan
 from jawusd.tracking.performance import skin as module
 from jawusd.tracking.performance.results import tracks_of
+from jawusd.tracking.performance.shot import solve_by_skin
 from jawusd.tracking.performance.skin import SkinFactor, SkinFilter
-from jawusd.tracking.performance.skin_alone import solve_by_skin
 from jawusd.tracking.performance.system import TakeSystem
 
 FPS = 25.0

@@ -125,13 +125,13 @@ def _wrong_size(solver: ContourSolver, config: TrackingConfig, start: Array, vie
     poses = solver.solve(start, views, config.wide_gates_px, use).poses
     scales = np.zeros(len(views))
     for _ in range(_SIZE_ROUNDS):
-        grown = [magnified(view, scale) for view, scale in zip(views, scales, strict=True)]
+        grown = [magnified(view, 1.0 + scale) for view, scale in zip(views, scales, strict=True)]
         found = measure_magnification(solver.scans, [(poses, grown, use)], config)
         if found is None:
             return None
         own = found.scale - found.common
         scales = scales + np.where(np.abs(own) > _OWN_SCALE, own, 0.0)
-        grown = [magnified(view, scale) for view, scale in zip(views, scales, strict=True)]
+        grown = [magnified(view, 1.0 + scale) for view, scale in zip(views, scales, strict=True)]
         again = _aligned(solver, config, poses, grown, use)
         poses = again.solution.poses
     if np.abs(scales).max() > _LEAST_SCALE and _problem(again, config) is None and again.fit.min() >= _CLEAR_FIT:

@@ -67,8 +67,7 @@ class MaskSurvey:
     # axis 1 is (upper, lower)
     middles: Array
     areas_px: Array  # area of every mask [px], shape (F, 2, C); 0 without a mask
-    # world [mm] to homogeneous px of the survey images, shape (C, 3, 4)
-    matrices: Array
+    matrices: Array  # world [mm] to homogeneous px of the survey images, shape (C, 3, 4)
     eyes: Array  # camera centres in world coordinates [mm], shape (C, 3)
     fewest: int = FEWEST_CAMERAS  # minimum number of cameras with masks of both arches
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -35,30 +36,18 @@ _LEAST_SPREAD_PX = 0.3
 
 @dataclass(frozen=True, eq=False)
 class Magnification:
-    """Magnification of the teeth in each camera relative to that expected from calibration and scans.
+    """Magnification of the teeth in each camera relative to that expected from calibration and scans."""
 
-    Attributes:
-        scale, sigma_scale: relative error of the magnification, shape (C,): 0.05 if teeth appear 5 % larger than
-            expected.
-        bend, sigma_bend: change of `scale` from the optical axis to a radius of 25 mm at the teeth, shape (C,).
-        bias_px, sigma_bias_px: outward mask bias at working resolution, per arch, shape (C, 2).
-        turn_rad, move_mm: angle of rotation and distance of translation of each camera relative to the mean of all,
-            shape (C,).
-        motion_clear: significance of rotation and translation together, in standard deviations (Mahalanobis), shape
-            (C,).
-        spread_px: robust standard deviation of the residuals.
-    """
-
-    scale: Array
+    scale: Array  # relative error of the magnification, shape (C,): 0.05 if teeth appear 5 % larger than expected
     sigma_scale: Array
-    bend: Array
+    bend: Array  # change of `scale` from the optical axis to a radius of 25 mm at the teeth, shape (C,)
     sigma_bend: Array
-    bias_px: Array
+    bias_px: Array  # outward mask bias at working resolution, per arch, shape (C, 2)
     sigma_bias_px: Array
-    turn_rad: Array
-    move_mm: Array
-    motion_clear: Array
-    spread_px: float
+    turn_rad: Array  # angle of rotation of each camera relative to the mean of all, shape (C,)
+    move_mm: Array  # distance of translation of each camera relative to the mean of all, shape (C,)
+    motion_clear: Array  # significance of both together, in standard deviations (Mahalanobis), shape (C,)
+    spread_px: float  # robust standard deviation of the residuals
 
     @property
     def common(self) -> float:
@@ -70,16 +59,14 @@ class Magnification:
 Instant = tuple[Array, Sequence[View], Mask]
 
 
-@dataclass(frozen=True, eq=False)
-class _Rows:
+class _Rows(NamedTuple):
     """Linearised contour distances of an arch in a video frame: d = J x + C theta, pose x, shared unknowns theta."""
 
     distance: Array  # signed distances of the samples to the mask edges [px], shape (n,)
     length: Array  # contour length that each sample represents [px], shape (n,)
     pose: Array  # derivatives with respect to the twist of the arch, shape (n, 6)
     camera: Array  # camera index of each row, shape (n,)
-    # derivatives with respect to the unknowns of the row's camera, shape (n, _UNKNOWNS)
-    shared: Array
+    shared: Array  # derivatives with respect to the unknowns of the row's camera, shape (n, _UNKNOWNS)
 
 
 def measure_magnification(
@@ -95,7 +82,7 @@ def measure_magnification(
             rows = (_rows(scans, r, c, poses, view, pivot, config) for c, view in enumerate(views) if use[r, c])
             parts = [part for part in rows if part is not None]
             if len(parts) >= 2:
-                blocks.append(_joined(parts))
+                blocks.append(_Rows(*(np.concatenate(columns) for columns in zip(*parts, strict=True))))
     if not blocks:
         return None
     return _solved(blocks, cameras, config)
@@ -110,28 +97,18 @@ def _rows(
     if not len(samples):
         return None
     points = transform_points(pose, samples[:, X : Z + 1])
-    normal = samples[:, [NX, NY]]
-    pixel = samples[:, [U, V]]
     third = view.matrix[2, :3] @ points.T + view.matrix[2, 3]
-    along = np.einsum("nk,nkj->nj", normal, view.matrix[None, :2, :3] - pixel[..., None] * view.matrix[2, :3])
-    slope = along / third[:, None]
+    slope = displacement_slopes(samples, points, view.matrix)
     M = view.matrix[:, :3]
     focal = float(np.linalg.norm(np.cross(M[0], M[2]))) / float(M[2] @ M[2])
     radius_px = _RADIUS_MM * focal / float(np.median(third)) * float(np.linalg.norm(M[2]))
-    outwards = pixel - _principal_point(view.matrix)
-    radial = np.einsum("nk,nk->n", normal, outwards)
+    outwards = samples[:, [U, V]] - principal_point(view.matrix)
+    radial = np.einsum("nk,nk->n", samples[:, [NX, NY]], outwards)
     bias = np.zeros((len(samples), 2))
     bias[:, r] = 1.0
     centre = transform_point(poses[r], scan.centre)
-    shared = np.column_stack(
-        [
-            radial,
-            radial * (outwards**2).sum(1) / radius_px**2,
-            np.cross(points - pivot, slope),
-            slope,
-            bias,
-        ]
-    )
+    bent = radial * (outwards**2).sum(1) / radius_px**2
+    shared = np.column_stack([radial, bent, np.cross(points - pivot, slope), slope, bias])
     own = np.column_stack([np.cross(points - centre, slope), slope])
     return _Rows(distance, samples[:, LENGTH], own, np.full(len(samples), c), shared)
 
@@ -159,15 +136,6 @@ def _matched(scans: Sequence[Scan], r: int, view: View, poses: Array, config: Tr
         samples[:, LENGTH] *= np.nan_to_num(weights)
     found = np.isfinite(distance) & (samples[:, LENGTH] > 0)
     return samples[found], distance[found]
-
-
-def _joined(parts: Sequence[_Rows]) -> _Rows:
-    return _Rows(
-        *(
-            np.concatenate([getattr(part, name) for part in parts])
-            for name in ("distance", "length", "pose", "camera", "shared")
-        )
-    )
 
 
 def _solved(blocks: Sequence[_Rows], cameras: int, config: TrackingConfig) -> Magnification:
@@ -221,17 +189,23 @@ def _motion(theta: Array, covariance: Array, cameras: int) -> tuple[Array, Array
     return np.linalg.norm(twists[:, :3], axis=1), np.linalg.norm(twists[:, 3:], axis=1), clear
 
 
-def magnified(view: View, scale: float) -> View:
-    """Return a view with the focal length multiplied by 1 + scale."""
-    axis, grown = _principal_point(view.matrix), 1.0 + scale
-    enlarge = np.array([[grown, 0.0, -scale * axis[0]], [0.0, grown, -scale * axis[1]], [0.0, 0.0, 1.0]])
-    return replace(view, matrix=enlarge @ view.matrix)
+def magnified(view: View, factor: float) -> View:
+    """Return a view with the focal length multiplied by a factor."""
+    grow = np.diag([factor, factor, 1.0])
+    grow[:2, 2] = (1.0 - factor) * principal_point(view.matrix)
+    return replace(view, matrix=grow @ view.matrix)
 
 
-def _principal_point(matrix: Array) -> Array:
-    """Return the principal point of a projection (3, 4) [px], shape (2,)."""
-    M = matrix[:, :3]
-    return np.asarray(M[:2] @ M[2] / (M[2] @ M[2]))
+def principal_point(matrix: Array) -> Array:
+    """Return the principal point of a projection (3, 4) without skew [px], shape (2,)."""
+    return np.asarray(matrix[:2, :3] @ matrix[2, :3] / (matrix[2, :3] @ matrix[2, :3]), np.float64)
+
+
+def displacement_slopes(samples: Array, points: Array, matrix: Array) -> Array:
+    """Return derivatives (n, 3) of samples' normal displacements [px] with respect to their world points (n, 3)."""
+    depth = points @ matrix[2, :3] + matrix[2, 3]
+    across = matrix[:2, :3] - samples[:, [U, V], None] * matrix[2, :3]
+    return np.asarray(np.einsum("nk,nkj->nj", samples[:, [NX, NY]], across) / depth[:, None], np.float64)
 
 
 def _spread(distances: Array) -> float:

@@ -46,14 +46,12 @@ class Occlusion:
     # fraction of crown points directly above or below crowns of the other arch; the larger of the two values
     opposite: float
     aside_mm: float  # distance between the centres of the arches along the occlusal plane [mm]
-    # angle in the occlusal plane between the forward directions of both arches [rad]
-    turn_rad: float
+    turn_rad: float  # angle in the occlusal plane between the forward directions of both arches [rad]
     # per arch, whether its gum lies between its crowns and the other arch; None if unknown
     turned_over: tuple[bool | None, bool | None]
     opens_towards: tuple[bool, bool]  # per arch, whether the open side of its crowns faces the other arch
     midlines_mm: float  # lateral distance between the midlines, where both arches have teeth left and right [mm]
-    # ratio of the upper to the lower width, measured in the same transverse slabs
-    width_ratio: float
+    width_ratio: float  # ratio of the upper to the lower width, measured in the same transverse slabs
     widths_mm: tuple[float, float]  # maximum extent of each arch in its own plane [mm]
     lower_ahead_mm: float  # distance by which the lower front teeth lie in front of the upper ones [mm]
 
@@ -65,8 +63,7 @@ class CrownSurface:
     points: Array  # centres of faces [mm], shape (N, 3)
     normals: Array  # outward unit normals, shape (N, 3)
     areas: Array  # areas of these faces [mm^2], shape (N,)
-    # whether a sample adjoins an opening of the surface, where the inside is undefined, shape (N,)
-    border: Mask
+    border: Mask  # whether a sample adjoins an opening of the surface, where the inside is undefined, shape (N,)
 
 
 def measure_occlusion(scans: Sequence[Scan], T_anatomical_scan: Array) -> Occlusion:

@@ -23,10 +23,8 @@ from jawusd.tracking.contour.scan import CROWN, Scan, prepare_scan
 from jawusd.tracking.contour.views import View
 
 _CELL_MM = 1.2  # size of the cells in which vertices are merged [mm]
-# blur of the outlines [mm], which keeps the coarse grid from missing the optimum
-_BLUR_MM = 0.9
-# Penalty per mm^2 of uncovered mask, in mm of matched outline [1/mm].
-_UNCOVERED_PRICE = 1.0
+_BLUR_MM = 0.9  # blur of the outlines [mm], which keeps the coarse grid from missing the optimum
+_UNCOVERED_PRICE = 1.0  # penalty per mm^2 of uncovered mask, in mm of matched outline [1/mm]
 
 
 @dataclass(frozen=True)

@@ -168,8 +168,7 @@ def _check_upright(search: StartSearch, footage: Footage, frame: int, found: Sea
 
 
 _PICKS_OFF_MM = 3.0  # minimum distance between picked and found poses for a warning [mm]: half a tooth
-# Maximum uncertainty of picked poses for the contour solver to converge from them [mm].
-_SURE_MM = 0.8
+_SURE_MM = 0.8  # maximum uncertainty of picked poses for the contour solver to converge from them [mm]
 
 
 def find_start(

@@ -10,7 +10,7 @@ import numpy as np
 
 from jawusd.base.arrays import Array, Mask
 from jawusd.tracking.contour.equations import Solution
-from jawusd.tracking.contour.quality import matched_px, residual_px, score_px
+from jawusd.tracking.contour.quality import coverage_error, matched_px, residual_px, score_px
 from jawusd.tracking.contour.rendering import Rendering
 from jawusd.tracking.contour.scan import ARCHES, CROWN
 from jawusd.tracking.contour.views import FEWEST_MASKS, View, present_masks
@@ -21,35 +21,22 @@ from jawusd.tracking.performance.views import Growth
 #: Upper bounds on the standard deviations of head rotation, head translation and jaw after many frames without visible
 #: teeth [rad, mm, mm].
 LARGEST_SIGMA = np.r_[[0.3] * 3, [30.0] * 3, [10.0] * 3]
-# Matched contour below which an arch is rejected [px]: 2 mm of tooth edge. Tracking without a rig requires a longer
-# contour.
-_LEAST_MATCHED_PX = 15.0
-_TYPICAL_PX = 0.4  # Typical residual of hand-drawn masks at the working resolution [px].
+_LEAST_MATCHED_PX = 15.0  # matched contour below which an arch is rejected [px]: 2 mm of tooth edge
+_TYPICAL_PX = 0.4  # typical residual of hand-drawn masks at the working resolution [px]
 
 
 @dataclass(frozen=True, eq=False)
 class FrameFit:
-    """Result of aligning one frame.
+    """Result of aligning one frame."""
 
-    Attributes:
-        pose: measured or extrapolated pose of head and jaw.
-        solution: matched outlines at the pose; None without any mask.
-        use: whether each mask is used, shape (2, C): true for available masks of arches that were found.
-        present: whether each mask is available, shape (2, C).
-        uncovered: fraction of every mask that is not covered by the scan, NaN without a mask, shape (2, C).
-        growth: derivatives of the outlines with respect to unknown focal lengths.
-        uncertain: whether less of the contour fits than usual, so that the pose may be wrong.
-        objective_px: score that ranks poses of this frame [px]; see `Trial.objective`.
-    """
-
-    pose: Pose
-    solution: Solution | None
-    use: Mask
-    present: Mask
-    uncovered: Array
-    growth: Growth | None = None
-    uncertain: bool = False
-    objective_px: float = 0.0
+    pose: Pose  # measured or extrapolated pose of head and jaw
+    solution: Solution | None  # matched outlines at the pose; None without any mask
+    use: Mask  # whether each mask is used, shape (2, C): true for available masks of arches that were found
+    present: Mask  # whether each mask is available, shape (2, C)
+    uncovered: Array  # fraction of every mask that is not covered by the scan, NaN without a mask, shape (2, C)
+    growth: Growth | None = None  # derivatives of the outlines with respect to unknown focal lengths
+    uncertain: bool = False  # whether less of the contour fits than usual, so that the pose may be wrong
+    objective_px: float = 0.0  # score that ranks poses of this frame [px]; see `Trial.objective`
 
     @property
     def found(self) -> Mask:
@@ -79,7 +66,7 @@ class Trial:
     @property
     def uncovered(self) -> Array:
         """Return the uncovered fraction of every mask; NaN without a mask."""
-        return np.where(self.mask_px > 0, self.uncovered_px / np.maximum(self.mask_px, 1), np.nan)
+        return coverage_error(self.uncovered_px, self.mask_px)
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,10 +82,7 @@ class Attempts:
     """Aligns single frames, and accepts or rejects results by comparison with the usual residual of the take."""
 
     def __init__(self, instants: InstantSolver, outline_weight: Array, usual_px: Array | None = None) -> None:
-        """Prepare the attempts; `usual_px` is the usual residual per arch [px], shape (2,), if known.
-
-        `outline_weight` is as for `InstantSolver.align`.
-        """
+        """Prepare with the `outline_weight` of `InstantSolver.align`, and the usual residual per arch (2,) [px]."""
         self.instants, self.config, self._weight = instants, instants.config, outline_weight
         self._residuals: deque[Array] = deque(maxlen=self.config.history_frames)
         if usual_px is not None:
@@ -146,6 +130,10 @@ class Attempts:
 
         Each of two masks may fit without the other, so the result that is nearest to the expected pose is kept.
         """
+
+        def distance(other: Trial) -> float:
+            return float(expected.precision @ self.instants.coordinates.step(expected.pose, other.pose) ** 2)
+
         for r in ARCHES:
             masks = np.flatnonzero(trial.use[r])
             if not self.bad(trial)[r] or not self._spare(trial, r):
@@ -156,7 +144,7 @@ class Attempts:
                 use[r, c] = False
                 others.append(self.attempt(expected.pose, expected, instant, use, self.config.wide_gates_px))
             fitting = [other for other in others if not self.bad(other)[r]]
-            trial = min(fitting, key=lambda other: self._distance(expected, other), default=trial)
+            trial = min(fitting, key=distance, default=trial)
         return trial
 
     def _spare(self, trial: Trial, arch: int) -> bool:
@@ -166,11 +154,6 @@ class Attempts:
         """
         own, other = trial.use[arch].sum(), trial.use[1 - arch].sum()
         return bool(own > FEWEST_MASKS or (own == FEWEST_MASKS <= other and self._residuals))
-
-    def _distance(self, expected: Expected, trial: Trial) -> float:
-        """Return the squared distance from the expected pose in standard deviations."""
-        step = self.instants.coordinates.step(expected.pose, trial.pose)
-        return float(expected.precision @ step**2)
 
     def judged(self, trial: Trial, instant: Instant) -> FrameFit:
         """Return the attempt as a frame fit, excluding arches that do not fit their masks."""

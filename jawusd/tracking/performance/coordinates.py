@@ -1,7 +1,7 @@
 """The unknowns of a frame (head pose and jaw parameters), and derivatives of both arches with respect to them.
 
-A frame has nine unknowns: omega [rad], v [mm], d1, d2, d3 [mm]. The first six are a twist of the head in its own axes
-about the pivot, which is the centre of the upper crowns; the last three are the jaw parameters.
+A frame has nine unknowns: a twist (omega [rad], v [mm]) of the head in its own axes about the pivot, which is the
+centre of the upper crowns, and the jaw parameters d1, d2, d3 [mm].
 """
 
 from __future__ import annotations
@@ -48,7 +48,6 @@ class Coordinates:
     """
 
     def __init__(self, jaw: JawRig, scans: Sequence[Scan]) -> None:
-        """Create coordinates with the pivot at the centre of the upper scan; `scans` are upper and lower scan."""
         self.jaw, self.pivot, self._lower_centre = jaw, scans[0].centre, scans[1].centre
         self.closed_mm = min(0.0, float(jaw.captured_d[:, 0].min(initial=0.0)))
         self._to_pivot = make_transform(np.eye(3), -self.pivot)
@@ -68,7 +67,7 @@ class Coordinates:
     def slopes(self, pose: Pose) -> tuple[Array, Array]:
         """Return the derivatives of both arches' left world twists with respect to the unknowns, shape (6, 9) each.
 
-        The twists are about the centres of the crowns, as in `Solution.centres`.
+        The twists are about the centres of the crowns.
         """
         relative = self.jaw.pose(pose.d)
         turn = se3_adjoint(make_transform(pose.head[:3, :3], np.zeros(3)))

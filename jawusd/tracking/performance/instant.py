@@ -15,12 +15,9 @@ from jawusd.tracking.contour.scan import ARCHES, thinned
 from jawusd.tracking.contour.solver import ContourSolver, Matched
 from jawusd.tracking.contour.views import View
 from jawusd.tracking.performance.coordinates import HEAD, JAW, LOCAL, OPENING, Coordinates, Pose
-from jawusd.tracking.performance.misfit import Misfit
 
-# Standard deviation of the rig's soft bound, and distance beyond it from which the penalty grows linearly [mm]. The
-# bound is the range of motion in the take that the rig was fitted to; with a hard bound, jaws beyond this range would
-# be lost. In other takes of 14 synthetic persons, a third of the frames lies beyond, by distances of 1.6 mm on average
-# that are distributed exponentially; the penalty is that of such a distribution.
+# Standard deviation of the rig's soft bound, and distance beyond it from which the penalty grows linearly [mm]. Jaws
+# leave the captured range by distances that are distributed exponentially, see docs/explanation/constants.md.
 _BOUND_MM, _BOUND_LINEAR_MM = 1.0, 0.6
 # Standard deviation of openings below the smallest captured one [mm]: closed teeth cannot close further.
 CLOSED_MM = 0.1
@@ -42,6 +39,50 @@ class Aligned:
     pose: Pose
     solution: Solution
     expected: Expected
+
+
+class Misfit:
+    """The misfit: the part of the mandible's pose that the rig cannot reproduce, as an unknown of every frame.
+
+    Without it, masks of both arches that contradict the rig would push the head and the jaw away, or a correct mask
+    would be left unmatched. Its prior is the covariance of the rig's own error. It is eliminated from the normal
+    equations of a frame in N unknowns, and estimated after each step.
+
+    Attributes:
+        matrix, right: what the elimination adds to the normal matrix (N, N) and the right-hand side (N,).
+        precision: precision of the lower arch's twist if the misfit is unknown, shape (6, 6).
+    """
+
+    def __init__(
+        self,
+        coordinates: Coordinates,
+        pose: Pose,
+        sums: tuple[Array, Array],
+        coupling: Array,
+        of_rig: Array | None = None,
+    ) -> None:
+        """Eliminate the misfit at a pose.
+
+        Args:
+            sums: precision (6, 6) and gradient (6,) of the lower arch's twist, as in `Coordinates.slopes`.
+            coupling: block of the normal matrix that couples this twist with the unknowns, shape (6, N).
+            of_rig: covariance of the rig's own error, shape (6, 6); default: at the pose.
+        """
+        precision, gradient = sums
+        if of_rig is None:
+            of_rig = coordinates.jaw.pose_covariance(pose.d)
+        self._slope, self._coupling = coordinates.error_slope(pose), coupling
+        prior, offset = self._slope @ of_rig @ self._slope.T, self._slope @ pose.misfit
+        kept = np.linalg.inv(np.eye(6) + precision @ prior)
+        self.precision, self._spread = kept @ precision, prior @ kept
+        self._gradient = gradient + precision @ offset  # at zero misfit
+        self.matrix = -coupling.T @ self._spread @ coupling
+        self.right = coupling.T @ (offset - self._spread @ self._gradient)
+
+    def after(self, step: Array) -> Array:
+        """Return the misfit, shape (6,) [rad, mm], after a step of the unknowns, shape (N,)."""
+        moved = self._spread @ (self._gradient - self._coupling @ step)
+        return np.asarray(np.linalg.solve(self._slope, moved), np.float64)
 
 
 class Equations(NamedTuple):
@@ -72,10 +113,8 @@ class InstantSolver:
         """Return the most likely pose.
 
         Args:
-            start: initial pose.
-            views, use: one view per camera, and the masks to use, shape (2, C).
+            use: the masks to use, shape (2, C).
             gates_px: residual gate of every step.
-            expected: prior on the pose.
             outline_weight: 1 / (outline variance times correlation length) of both arches [1/px^3], shape (2,).
             rendering: rendering of these views; default: a new rendering.
         """
@@ -86,9 +125,8 @@ class InstantSolver:
             state = self.linearise(pose, views, use, rendering, left[0])
             matrix, right, misfit = self.equations(pose, state, outline_weight, of_rig)
             away = self.coordinates.step(expected.pose, pose)
-            step = np.asarray(
-                np.linalg.solve(matrix + np.diag(expected.precision), right - expected.precision * away), np.float64
-            )
+            pulled = right - expected.precision * away
+            step = np.asarray(np.linalg.solve(matrix + np.diag(expected.precision), pulled), np.float64)
             pose = replace(self.coordinates.moved(pose, step), misfit=misfit.after(step))
             moved_mm = self._motion_mm(step)
             left = self.config.gates_after(left, moved_mm)
@@ -110,10 +148,7 @@ class InstantSolver:
         return self.solver.linearise(self.coordinates.arches(pose), views, use, gate, rendering, final, matched)
 
     def equations(self, pose: Pose, state: Solution, outline_weight: Array, of_rig: Array | None = None) -> Equations:
-        """Return the equations of a step, from matched outlines and the rig's bound.
-
-        `of_rig` is the covariance of the rig's own error, shape (6, 6); default: at the pose.
-        """
+        """Return the equations of a step, from matched outlines and the rig's bound; `of_rig` is as for `Misfit`."""
         matrix, right = bound_equations(self.coordinates, pose.d)
         outlines = self.outline_equations(pose, state, outline_weight, of_rig)
         return Equations(matrix + outlines.matrix, right + outlines.right, outlines.misfit)
@@ -143,10 +178,7 @@ def bound_equations(coordinates: Coordinates, d: Array, at: Array | None = None)
     """Return normal matrix (9, 9) and right-hand side (9,) of the penalties on poses outside the bound or overclosed.
 
     Outlines of closed teeth fit nearly as well with the lower teeth some millimetres higher, inside the upper teeth.
-
-    Args:
-        d: jaw parameters before the step, shape (3,).
-        at: jaw parameters at which the penalties, which are zero inside the bound, are linearised; default: `d`.
+    The penalties at d (3,) are linearised at the jaw parameters `at` (3,); default: `d`.
     """
     matrix, right = np.zeros((LOCAL, LOCAL)), np.zeros(LOCAL)
     at = d if at is None else at
@@ -166,12 +198,8 @@ def rig_gain(coordinates: Coordinates, pose: Pose, matrix: Array, lower: Array, 
     """Return the derivative (3, 6) of the estimated d with respect to an error of the rig, from one frame.
 
     Where the outlines determine d poorly, an error of the rig is amplified: the head and d move until the outlines fit.
-
-    Args:
-        pose: estimated pose.
-        matrix: normal matrix of the frame, positive definite, shape (9, 9).
-        lower: precision of the lower arch's twist, shape (6, 6); see `Misfit`.
-        fixed_head: whether the head is known.
+    `matrix` is the normal matrix of the frame, positive definite, shape (9, 9); `lower` is the precision of the lower
+    arch's twist, shape (6, 6), as in `Misfit`.
     """
     free = JAW if fixed_head else slice(0, LOCAL)
     slope = coordinates.slopes(pose)[1][:, free]

@@ -14,19 +14,15 @@ from jawusd.tracking.performance.coordinates import JAW, LOCAL, Coordinates, Pos
 from jawusd.tracking.performance.instant import Expected
 
 # Standard deviations of predicted head rotation, head translation and jaw parameters [rad, mm, mm], for fast chewing at
-# 24 frames per second. They only regularise directions that the images do not determine; the smoother uses measured
-# variances.
+# 24 frames per second; they only regularise directions that the images do not determine.
 _MISS = np.r_[[0.01] * 3, [0.7] * 3, [0.7] * 3]
 #: Factors on the standard deviations of the head: if the head hardly moves relative to the cameras, and if its pose is
 #: known.
 STEADY, KNOWN = 0.05, 1e-4
 _DAMPING = 0.8  # factor by which the velocity is damped in every frame
 
-# Ratio of the prior's variance to the measured mean square [-]: above 1, since motion is mostly smooth, but has abrupt
-# changes.
-_LOOSE = 4.0
-# Lower bounds on the variances of second differences [rad^2, mm^2].
-_LEAST_HEAD = np.r_[[1e-4] * 3, [0.01] * 3] ** 2
+_LOOSE = 4.0  # ratio of the prior's variance to the measured mean square [-]: motion is smooth, but has abrupt changes
+_LEAST_HEAD = np.r_[[1e-4] * 3, [0.01] * 3] ** 2  # lower bounds on the variances of second differences [rad^2, mm^2]
 _LEAST_JAW = np.full(3, 0.02**2)
 _FEWEST_BENDS = 20  # minimum number of second differences for estimating their variance
 # default mean squares of second differences, from exercises at 24 frames per second [mm^2]
@@ -46,11 +42,7 @@ class Prediction:
     """
 
     def __init__(self, coordinates: Coordinates, begin: Pose, found: Mask, *, head: float = 1.0) -> None:
-        """Start at rest from the pose of a frame; `found` is whether each arch was found in it, shape (2,).
-
-        Args:
-            head: factor on the standard deviations of the head.
-        """
+        """Start at rest from a pose in which arches were `found`, shape (2,); `head` scales the head's deviations."""
         self._coordinates, self._miss = coordinates, _MISS * np.r_[[head] * 6, [1.0] * 3]
         self.last, self._velocity, self._frames = begin, np.zeros(LOCAL), 1.0
         self.blind = np.where(found, 0, 1)
@@ -101,10 +93,7 @@ def head_bends(coordinates: Coordinates, poses: Sequence[Pose]) -> tuple[Array, 
 def measured_motion(coordinates: Coordinates, poses: Sequence[Pose], good: Mask, fps: float) -> Motion:
     """Return the variances of a take's motion; if too few frames are good, those of the rig's training take.
 
-    Args:
-        poses: poses of consecutive frames.
-        good: whether both arches were found in each frame, shape (N,).
-        fps: frames per second.
+    `poses` are those of consecutive frames; `good`, shape (N,), tells whether both arches were found.
     """
     bend, step = head_bends(coordinates, poses)
     d = np.stack([pose.d for pose in poses])

@@ -31,12 +31,8 @@ def performance_of(
     """Return the performance of a take.
 
     Args:
-        jaw: the subject's rig.
         pivot: point of the upper scan about which the head rotates [mm], shape (3,).
         frames: frame numbers of the reference camera, in the order of the fits.
-        smoothed: the take after the second pass.
-        camera_names: names of the cameras in the order of the views.
-        fps: frames per second.
         free_focal: whether focal lengths were estimated, relative to those of the cameras.
     """
     fits = smoothed.fits
@@ -77,8 +73,8 @@ def performance_of(
 def tracks_of(performance: Performance, jaw: JawRig) -> Tracks:
     """Return the poses of both arches and their covariances as tracks.
 
-    Final poses exist for every frame; arches that are not visible count as lost and have no raw poses. The standard
-    deviations of the landmarks include the uncertainty of the rig.
+    Arches that are not visible count as lost and have no raw poses. The standard deviations of the landmarks include
+    the uncertainty of the rig.
     """
     p = performance
     head, relative = p.T_world_upper, jaw.pose(p.d)
@@ -97,20 +93,19 @@ def tracks_of(performance: Performance, jaw: JawRig) -> Tracks:
     if isinstance(moved, dict) and moved.get("applied"):  # the lower scan is registered as in the rig
         meta["registration"] = cast(Registration, moved)
     count, cameras = len(p.frames), len(p.camera_names)
-    raw = {"upper": head.copy(), "lower": lower.copy(), "relative": relative.copy()}
-    raw["upper"][~p.found[:, 0]], raw["lower"][~p.found[:, 1]], raw["relative"][~p.found.all(1)] = (
-        np.nan,
-        np.nan,
-        np.nan,
-    )
+    seen = (*p.found.T, p.found.all(1))
+    raw = [
+        np.where(known[:, None, None], poses, np.nan)
+        for known, poses in zip(seen, (head, lower, relative), strict=True)
+    ]
     return Tracks(
         frames=p.frames,
         T_world_upper=head,
         T_world_lower=lower,
         T_upper_lower=relative,
-        raw_T_world_upper=raw["upper"],
-        raw_T_world_lower=raw["lower"],
-        raw_T_upper_lower=raw["relative"],
+        raw_T_world_upper=raw[0],
+        raw_T_world_lower=raw[1],
+        raw_T_upper_lower=raw[2],
         status=np.where(p.found, TRACKED, LOST).astype(np.int8),
         prior_aided=np.ones(count, bool),
         coverage_error=p.uncovered.reshape(count, 2, cameras),

@@ -1,10 +1,10 @@
-"""The solve of a shot: start pose, first pass in both directions, and joint refinement."""
+"""The solve of a shot (start pose, first pass in both directions, joint refinement), or of skin alone."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, MutableMapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -27,7 +27,7 @@ from jawusd.tracking.initialization.footage import Footage
 from jawusd.tracking.initialization.scan_checks import check_occlusion
 from jawusd.tracking.initialization.start import find_start
 from jawusd.tracking.performance.attempts import Attempts, FrameFit, usual_residual_px
-from jawusd.tracking.performance.coordinates import Coordinates, Pose
+from jawusd.tracking.performance.coordinates import HEAD, Coordinates, Pose
 from jawusd.tracking.performance.forward import ForwardPass
 from jawusd.tracking.performance.instant import InstantSolver, quick, whole
 from jawusd.tracking.performance.results import performance_of
@@ -41,28 +41,17 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """Input of a solve.
-
-    Attributes:
-        views: source of the views of each frame.
-        camera_names: names of the cameras, in the order of the views.
-        frames: range of reference-camera frames, end exclusive.
-        start_frame, start: initial frame and pose.
-        fps: frames per second.
-        fixed_head: whether the cameras are head-mounted, so that the head pose is constant.
-        free_focal: whether to estimate the focal lengths.
-        skin: jaw parameters estimated from facial skin, if known.
-    """
+    """Input of a solve."""
 
     views: Views
-    camera_names: tuple[str, ...]
-    frames: tuple[int, int]
+    camera_names: tuple[str, ...]  # in the order of the views
+    frames: tuple[int, int]  # range of reference-camera frames, end exclusive
     start_frame: int
     start: Pose
     fps: float
-    fixed_head: bool = False
-    free_focal: bool = False
-    skin: SkinOf | None = None
+    fixed_head: bool = False  # whether the cameras are head-mounted, so that the head pose is constant
+    free_focal: bool = False  # whether to estimate the focal lengths
+    skin: SkinOf | None = None  # jaw parameters estimated from facial skin
 
 
 def solve_performance(
@@ -76,10 +65,7 @@ def solve_performance(
     """Solve head pose and jaw parameters of every frame of a shot.
 
     Args:
-        jaw: the subject's rig.
         scans: prepared scans of the upper and lower teeth.
-        shot: views, frames and start.
-        config: settings of the tracker.
         progress: called after each frame with the number of frames done and the total.
 
     Raises:
@@ -153,13 +139,13 @@ class _Take:
         """Refine all frames jointly."""
         frames = sorted(self.fits)
         fits = [self.fits[frame] for frame in frames]
-        shot, cameras = self._shot, len(self._shot.camera_names)
+        shot = self._shot
         smoother = Smoother(
             self._full,
             self._views,
             frames,
             shot.fps,
-            cameras,
+            len(shot.camera_names),
             fixed_head=shot.fixed_head,
             free_focal=shot.free_focal,
             skin=jaw_of_skin(shot.skin, frames, fits),
@@ -180,7 +166,7 @@ def solve_capture(
     free_focal: bool = False,
     skin: SkinOf | None = None,
     threads: int = 2,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> Performance:
     """Solve the performance of a capture.
 
@@ -189,11 +175,7 @@ def solve_capture(
         cameras: calibrated cameras; world lengths are in mm.
         offsets: time offsets by camera name: the reference frame number minus the camera's own frame number.
         upper, lower: teeth scans in the coordinate frame of the rig's scans [mm].
-        jaw: the subject's rig.
-        config: settings of the tracker.
-        fixed_head: whether the cameras are head-mounted, so that the head pose is constant.
-        free_focal: whether to estimate the focal lengths, starting from the calibrated ones.
-        skin: jaw parameters estimated from facial skin, if known.
+        fixed_head, free_focal, skin: as in `Shot`; focal lengths start from the calibrated ones.
         threads: number of threads of the start search; the result does not depend on it.
         progress: called after each frame with the number of frames done and the total.
 
@@ -256,3 +238,18 @@ def _begin(
     found = SingleStart(meshes, solver, jaw, T_anatomical_scan, map_).find(footage)
     notes: dict[str, object] = {"by": "search with the rig", "frame": found.frame, "fit": found.fit}
     return _Begin(found.frame, found.pose, notes, tuple(findings))
+
+
+def solve_by_skin(jaw: JawRig, scans: Sequence[Scan], skin: SkinOf, frames: range, fps: float) -> Performance:
+    """Solve the jaw parameters of every frame from facial skin, without images of the teeth.
+
+    The head frame is used as the world frame: the head pose is the identity, without uncertainty. There are no cameras.
+    """
+    coordinates = Coordinates(jaw, scans)
+    count, none = len(frames), np.zeros((2, 0), bool)
+    fits = [FrameFit(Pose(np.eye(4), np.zeros(3)), None, none, none, np.zeros((2, 0)))] * count
+    instants = InstantSolver(ContourSolver(scans, TrackingConfig()), coordinates)
+    smoothed = Smoother(instants, None, frames, fps, 0, skin=jaw_of_skin(skin, frames, fits)).run(fits)
+    covariance = smoothed.covariance.copy()
+    covariance[:, HEAD] = covariance[:, :, HEAD] = 0.0
+    return performance_of(jaw, coordinates.pivot, frames, replace(smoothed, covariance=covariance), (), fps)

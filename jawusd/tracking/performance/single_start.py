@@ -34,7 +34,7 @@ from jawusd.tracking.initialization.pose_search import (
     search_arch,
 )
 from jawusd.tracking.initialization.start_search import guessed_axes
-from jawusd.tracking.performance.attempts import LARGEST_SIGMA, Attempts, FrameFit, Instant
+from jawusd.tracking.performance.attempts import LARGEST_SIGMA, Attempts, Instant
 from jawusd.tracking.performance.coordinates import Coordinates, Pose
 from jawusd.tracking.performance.instant import Expected, InstantSolver
 
@@ -44,8 +44,7 @@ _ANYWHERE_MM = 200.0
 # Number of frames surveyed for large masks; number of frames after which an acceptable start ends the search; and
 # maximum number of frames searched.
 _SURVEYED, _FRAMES_TRIED, _MOST_TRIED = 24, 4, 10
-# Candidate widths of the visible teeth [mm], from the front teeth to a whole arch, each a tenth larger than the one
-# before. They determine the distance from the camera.
+# Candidate widths of the visible teeth [mm], from the front teeth to a whole arch; they determine the distance.
 _WIDTHS_MM = 22.0 * 1.1 ** np.arange(14)
 _USUAL_WIDTH_MM = 42.0
 # A side camera sees more of one side of the arch, so the centre of its mask lies up to 16 mm beside the front teeth (18
@@ -85,15 +84,7 @@ class SingleStart:
     def __init__(
         self, meshes: Sequence[Mesh], solver: ContourSolver, jaw: JawRig, T_anatomical_scan: Array, map_: Mapper = map
     ) -> None:
-        """Prepare coarse scans.
-
-        Args:
-            meshes: upper and lower teeth scans in one coordinate frame [mm].
-            solver: solver prepared with the same scans.
-            jaw: the subject's rig.
-            T_anatomical_scan: scan frame to (left, up, front) axes, shape (4, 4).
-            map_: map function that may process orientations in parallel.
-        """
+        """Prepare coarse scans; `T_anatomical_scan` (4, 4) maps the scan frame to (left, up, front) axes."""
         solver = solver.exact()
         self._jaw, self._map, self._config = jaw, map_, solver.config
         self._coarse = tuple(coarse_scan(mesh, name) for mesh, name in zip(meshes, ARCH_NAMES, strict=True))
@@ -146,15 +137,15 @@ class SingleStart:
         instant = self._rough.instant(views)
         ends = [self._after(pose, instant, self._rough.config.wide_gates_px) for pose in self._searched(views, places)]
         ends = sorted(ends, key=_descending)[:_WINNERS]
-        best: tuple[float, FrameFit] | None = None
+        best: FoundPose | None = None
         px_per_mm = self._config.working_px_per_mm
         for _, pose in ends:
             with footage.views(transform_point(pose.head, self._coarse[0].centre), px_per_mm) as masks:
                 views = masks.at(frame)
-            end = self._refined(pose, self._fine, views)
-            if end is not None and (best is None or end[0] > best[0]):
+            end = self._refined(pose, views, frame)
+            if end is not None and (best is None or end.fit > best.fit):
                 best = end
-        return None if best is None else FoundPose(frame, best[1].pose, best[0])
+        return best
 
     def _searched(self, views: Sequence[View], places: Array) -> list[Pose]:
         """Return the most promising head poses, each with the most promising jaw pose for it.
@@ -215,13 +206,13 @@ class SingleStart:
         price = self._config.uncovered_price * self._config.working_px_per_mm / _PX_PER_MM
         return trial.objective(price) - outside, trial.pose
 
-    def _refined(self, pose: Pose, attempts: Attempts, views: Sequence[View]) -> tuple[float, FrameFit] | None:
-        """Return the fit of the worse arch after alignment, and the frame fit; None if an arch is not found."""
-        found = attempts.near(pose, attempts.instant(views), LARGEST_SIGMA)
+    def _refined(self, pose: Pose, views: Sequence[View], frame: int) -> FoundPose | None:
+        """Align a pose at working resolution; return None if an arch is not found."""
+        found = self._fine.near(pose, self._fine.instant(views))
         if found.solution is None or not found.found.all():
             return None
-        scans = attempts.instants.solver.scans
-        return float(arch_fit(scans, found.solution, views, self._config.uncovered_price).min()), found
+        fit = arch_fit(self._fine.instants.solver.scans, found.solution, views, self._config.uncovered_price)
+        return FoundPose(frame, found.pose, float(fit.min()))
 
 
 def _descending(entry: tuple[float, Pose]) -> float:

@@ -18,9 +18,8 @@ from jawusd.evaluator.skin import SkinJaw
 from jawusd.tracking.performance.attempts import FrameFit
 from jawusd.tracking.performance.system import TakeSystem
 
-#: Function that returns the jaw parameters estimated from facial skin in some frames. Arguments: frame numbers, shape
-#: (F,); d of the first pass [mm], shape (F, 3); whether both arches were found in each frame, shape (F,); and poses of
-#: the head T_world_skull, shape (F, 4, 4).
+#: Returns the jaw parameters estimated from facial skin, given frame numbers (F,), d of the first pass (F, 3) [mm],
+#: whether both arches were found (F,), and T_world_skull (F, 4, 4).
 SkinOf = Callable[[Array, Array, Mask, Array], SkinJaw]
 
 #: Number of unknowns per frame: components of the slowly varying error, in units of its standard deviation.
@@ -39,13 +38,7 @@ class SkinFactor:
     """
 
     def __init__(self, skin: SkinJaw, fps: float, wider: float = 1.0) -> None:
-        """Prepare the factor.
-
-        Args:
-            skin: jaw parameters estimated from skin, in every frame.
-            fps: frames per second.
-            wider: factor on all precisions, if covariances of the system are multiplied by it later.
-        """
+        """Prepare with d of every frame; `wider` multiplies all precisions, as covariances are multiplied later."""
         self.used: Mask = np.asarray(np.isfinite(skin.d).all(axis=-1))
         self.familiar: Mask = np.asarray(self.used & skin.familiar)
         self._d, self._wider = skin.d, wider
@@ -62,13 +55,10 @@ class SkinFactor:
         ]
 
     def add(self, system: TakeSystem, d: Array, slow: Array, first: int) -> None:
-        """Add the factor to the equations of a take.
+        """Add the factor to the equations of a take, in which the slow error is the last unknowns of each frame.
 
-        Args:
-            system: equations; the slow error is the last unknowns of each frame.
-            d: current jaw parameters [mm], shape (F, 3).
-            slow: current slow error, shape (F, 3).
-            first: index of the jaw parameters in the unknowns of a frame.
+        `d` [mm] and `slow`, shape (F, 3), are the current estimates; `first` is the index of d in the unknowns of a
+        frame.
         """
         size = system.local + system.shared
         last = system.local - SLOW
@@ -107,24 +97,19 @@ class SkinFilter:
     """The same measurements one frame at a time, for live tracking: a Kalman filter of the slow error."""
 
     def __init__(self) -> None:
-        """Start with an unknown slow error."""
         self._slow, self._covariance = np.zeros(SLOW), np.eye(SLOW)
 
     def fuse(
         self, skin: SkinJaw, d: Array, covariance: Array, *, seen: bool, seconds: float
     ) -> tuple[Array, Array, bool]:
-        """Combine d of a frame with d estimated from skin.
+        """Return d of a frame combined with d from skin, its covariance, and whether skin was used.
 
         Args:
-            skin: d estimated from skin in the frame, shape (3,).
-            d: jaw parameters without skin [mm], shape (3,): measured or predicted.
-            covariance: their covariance [mm^2], shape (3, 3).
+            skin: d estimated from skin in the frame, shape (3,); it is used only if the face is known.
+            d, covariance: measured or predicted d, shape (3,) [mm], and its covariance (3, 3).
             seen: whether d was measured from both arches. Only then is the slow error corrected, since a predicted d
                 repeats the errors of earlier frames.
             seconds: time since the previous frame [s].
-
-        Returns:
-            d and its covariance, and whether skin was used: only if the face is known.
         """
         keep = _correlation(seconds)
         self._slow = keep * self._slow
@@ -145,9 +130,7 @@ class SkinFilter:
 def _slow_and_fast(covariance: Array, seconds: float) -> tuple[Array, Array]:
     """Split covariances of d from skin (..., 3, 3) into slow and fast errors, for frames `seconds` apart.
 
-    Returns:
-        The derivative of d [mm] with respect to the slow error, and the covariance of the fast error [mm^2], shape
-        (..., 3, 3) each.
+    Return the derivative of d [mm] with respect to the slow error, and the covariance of the fast error [mm^2].
     """
     slope = np.sqrt(_SHARE) * np.linalg.cholesky(covariance)
     return slope, (1 - _SHARE) * max(1.0, _FAST_S / seconds) * covariance

@@ -23,10 +23,8 @@ from jawusd.tracking.performance.system import TakeSystem
 from jawusd.tracking.performance.unknowns import TakeState, Unknowns
 from jawusd.tracking.performance.views import Views, growth_of
 
-# Number of rounds in which outlines are matched again; a third round would change less than 0.01 mm.
-_ROUNDS = 2
-# number of rounds if focal lengths are unknown, since they are strongly coupled with the distance of the head
-_FOCAL_ROUNDS = 6
+_ROUNDS = 2  # number of rounds in which outlines are matched again; a third round would change less than 0.01 mm
+_FOCAL_ROUNDS = 6  # the same if focal lengths are unknown, since they are coupled with the distance of the head
 # Maximum number of solutions of the linearised equations, each with the bound linearised at the previous one; change of
 # d below which no further one is computed [mm].
 _BOUND_ROUNDS, _SAME_MM = 5, 0.05
@@ -69,17 +67,12 @@ class Smoother:
         """Configure the refinement.
 
         Args:
-            instants: solver of single frames.
             views: source of the views; None to use the outlines of the fits as matched. In that case, with a fixed
                 head, all fits must have the same head pose.
             frames: frame numbers in temporal order.
-            fps: frames per second.
-            cameras: number of cameras.
-            fixed_head: whether the head pose is constant.
-            free_focal: whether to estimate the focal lengths.
             shared_px3: variance times correlation length [px^3] of outline errors that the residuals do not show.
             annotator: prior on annotator bias; default: of hand-drawn masks.
-            skin: jaw parameters estimated from facial skin in every frame, if known.
+            skin: jaw parameters estimated from facial skin in every frame.
         """
         self._skin = None if skin is None else SkinFactor(skin, fps, WIDER)
         self._cameras, self._rounds, self._shared_px3 = cameras, _FOCAL_ROUNDS if free_focal else _ROUNDS, shared_px3
@@ -97,11 +90,9 @@ class Smoother:
         )
 
     def run(self, fits: Sequence[FrameFit], done: Callable[[int, int], None] = lambda done, total: None) -> Smoothed:
-        """Return the most likely take.
+        """Return the most likely take, from the fits of the first pass.
 
-        Args:
-            fits: fits of the first pass, in frame order.
-            done: called with the number of frames matched and the total number of frames.
+        `done` is called with the number of frames matched and the total number of frames.
         """
         config, fits = self._instants.config, list(fits)
         state, slow = self._unknowns.start(), np.zeros((len(fits), SLOW))
@@ -136,7 +127,8 @@ class Smoother:
         if self._unknowns.free_focal:
             sigma = np.sqrt(WIDER * np.diag(shared)[self._unknowns.focal])
         gains = np.stack([self._rig_gain(fit, weight) for fit in fits])
-        return Smoothed(fits, covariance, state, sigma, self._by_skin(len(fits)), gains)
+        by_skin = np.zeros(len(fits), bool) if self._skin is None else self._skin.used
+        return Smoothed(fits, covariance, state, sigma, by_skin, gains)
 
     def _moved(self, fit: FrameFit, pose: Pose, weight: Array) -> FrameFit:
         """Return the fit of a frame at another pose, with the misfit that belongs to it."""
@@ -152,9 +144,6 @@ class Smoother:
         outlines = self._instants.outline_equations(fit.pose, fit.solution, weight * fit.found)
         matrix, lower = np.diag(LARGEST_SIGMA**-2.0) + outlines.matrix, outlines.misfit.precision
         return rig_gain(self._coordinates, fit.pose, matrix, lower, fixed_head=self._unknowns.fixed_head)
-
-    def _by_skin(self, count: int) -> Mask:
-        return np.zeros(count, bool) if self._skin is None else self._skin.used
 
     def _step(
         self, fits: Sequence[FrameFit], state: TakeState, weight: Array, motion: Motion, slow: Array
@@ -181,11 +170,7 @@ class Smoother:
         slow: Array,
         bound_at: Array | None,
     ) -> TakeSystem:
-        """Linearise the equations of the take at its current state.
-
-        Args:
-            bound_at: jaw parameters at which the bound of the rig is linearised, shape (F, 3); None to omit it.
-        """
+        """Linearise the equations of the take; `bound_at` (F, 3) is where the bound is linearised, None to omit it."""
         unknowns = self._unknowns
         more = 0 if self._skin is None else SLOW
         system = TakeSystem(len(fits), unknowns.local + more, unknowns.shared)
@@ -279,10 +264,7 @@ def with_one_head(coordinates: Coordinates, fits: Sequence[FrameFit]) -> list[Fr
 
 
 def outline_variance(fits: Sequence[FrameFit], config: TrackingConfig) -> Array:
-    """Return variance times correlation length of the outline errors of a take, per arch [px^3], shape (2,).
-
-    The correlation length is estimated from the residuals.
-    """
+    """Return variance times correlation length of the outline errors of a take, per arch [px^3], shape (2,)."""
     solutions = [(fit.solution, fit.found) for fit in fits if fit.solution is not None and fit.found.any()]
     lengths = np.array([np.where(found, correlation_px(solution, config), np.nan) for solution, found in solutions])
     known = lengths[np.isfinite(lengths)]

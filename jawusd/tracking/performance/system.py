@@ -13,17 +13,11 @@ _STEP = (-1.0, 1.0)
 
 
 class TakeCovariance(NamedTuple):
-    """Covariance of the solution.
+    """Covariance of the solution."""
 
-    Attributes:
-        own: covariance of each frame's unknowns, conditional on the take's unknowns, shape (N, L, L).
-        response: derivative of each frame's unknowns with respect to the take's unknowns, shape (N, L, G).
-        shared: covariance of the unknowns of the take, shape (G, G).
-    """
-
-    own: Array
-    response: Array
-    shared: Array
+    own: Array  # covariance of each frame's unknowns, conditional on the take's unknowns, shape (N, L, L)
+    response: Array  # derivative of each frame's unknowns with respect to the take's unknowns, shape (N, L, G)
+    shared: Array  # covariance of the unknowns of the take, shape (G, G)
 
 
 class _Eliminated(NamedTuple):
@@ -39,7 +33,6 @@ class TakeSystem:
     """
 
     def __init__(self, frames: int, local: int, shared: int) -> None:
-        """Start without equations."""
         self.frames, self.local, self.shared = frames, local, shared
         # Entry k: blocks that couple each frame with the k-th frame after it.
         self._blocks = [np.zeros((max(frames - k, 0), local, local)) for k in range(3)]
@@ -62,12 +55,9 @@ class TakeSystem:
         self._corner_right += right
 
     def add_bends(self, columns: slice[int, int, None], bend: Array, weight: Array) -> None:
-        """Penalise second differences of the frames' unknowns.
+        """Penalise current second differences at frames 1 to N - 2, shape (N - 2, w), of a slice of a frame's unknowns.
 
-        Args:
-            columns: slice of a frame's unknowns.
-            bend: current second differences at frames 1 to N - 2, shape (N - 2, w).
-            weight: precision of the second differences, shape (w,) or (N - 2, w).
+        `weight` is the precision of the second differences, shape (w,) or (N - 2, w).
         """
         self._add(_BEND, columns, bend, weight)
 

@@ -14,25 +14,25 @@ from jawusd.base.arrays import Array
 from jawusd.tracking.contour.annotator import COMPONENTS, DRAWN, AnnotatorPrior, bias_layers
 from jawusd.tracking.contour.scan import ARCHES
 from jawusd.tracking.contour.views import View
+from jawusd.tracking.initialization.magnification import magnified
 from jawusd.tracking.performance.attempts import FrameFit
 from jawusd.tracking.performance.coordinates import HEAD, JAW, LOCAL, Coordinates, Pose
-from jawusd.tracking.performance.instant import bound_equations
-from jawusd.tracking.performance.misfit import Misfit
-from jawusd.tracking.performance.views import PRIOR_LOG_FOCAL, with_focal
+from jawusd.tracking.performance.instant import Misfit, bound_equations
+from jawusd.tracking.performance.views import PRIOR_LOG_FOCAL
 
 
 @dataclass(frozen=True, eq=False)
 class TakeState:
     """Current estimate of the unknowns of a take."""
 
-    layers: Array  # Annotator bias in the layers of `Unknowns`, shape (n,).
-    habits: Array  # Mask biases per arch and camera, shape (2, C, 3); see `View.habits`.
+    layers: Array  # annotator bias in the layers of `Unknowns`, shape (n,)
+    habits: Array  # mask biases per arch and camera, shape (2, C, 3); see `View.habits`
     log_focal: Array  # logarithm of the ratio of true to calibrated focal length, shape (C,)
 
     def corrected(self, views: Sequence[View]) -> list[View]:
         """Return the views of a frame, corrected by the estimated biases and focal lengths."""
         pairs = enumerate(zip(views, self.log_focal.tolist(), strict=True))
-        return [replace(with_focal(view, log_focal), habits=self.habits[:, c]) for c, (view, log_focal) in pairs]
+        return [replace(magnified(view, float(np.exp(log))), habits=self.habits[:, c]) for c, (view, log) in pairs]
 
 
 class Unknowns:
@@ -88,10 +88,8 @@ class Unknowns:
     def frame(self, fit: FrameFit, weight: Array, bound_at: Array | None) -> tuple[Array, Array]:
         """Return the normal matrix (L + G, L + G) and right-hand side (L + G,) of a frame, from outlines and bound.
 
-        Args:
-            fit: fit of the frame, with outlines matched at its pose.
-            weight: 1 / (outline variance times correlation length) of both arches [1/px^3], shape (2,).
-            bound_at: jaw parameters at which the bound of the rig is linearised, shape (3,); None to omit it.
+        `weight` is the `outline_weight` of `InstantSolver.align`; `bound_at` is the d (3,) at which the bound is
+        linearised, None to omit it.
         """
         pose, solution, found = fit.pose, fit.solution, fit.found
         bias = slice(LOCAL, LOCAL + len(self._sigma))
