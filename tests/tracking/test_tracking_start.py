@@ -33,7 +33,7 @@ from jawusd.tracking.contour.solver import ContourSolver
 from jawusd.tracking.contour.views import masked_sources
 from jawusd.tracking.initialization import start as take_start
 from jawusd.tracking.initialization import start_search
-from jawusd.tracking.initialization.footage import Footage, MaskSurvey, survey_masks
+from jawusd.tracking.initialization.footage import Footage, MaskSurvey
 from jawusd.tracking.initialization.pose_search import (
     Grid,
     ShiftCorrelation,
@@ -247,7 +247,7 @@ def test_reversed_faces_do_not_matter(pictures):
 
 def test_survey_finds_the_rows(pictures):
     sources = masked_sources(_capture(pictures).cameras, TABLE, OFFSETS)
-    survey = survey_masks(sources, TABLE, OFFSETS, (FIRST, FIRST + FRAMES), 3)
+    survey = Footage(sources, TABLE, OFFSETS, (FIRST, FIRST + FRAMES)).survey(None, 3)
     assert survey.frames.tolist() == [5, 7, 9]
     for k, frame in enumerate(survey.frames):
         for r in (0, 1):

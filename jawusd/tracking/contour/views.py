@@ -16,7 +16,7 @@ from jawusd.formats.capture import CameraSource
 from jawusd.formats.finding import Finding
 from jawusd.geometry import Camera
 from jawusd.media.mask_survey import ARCHES, odd_pictures, survey_masks
-from jawusd.media.masks import FrameMasks, open_masks
+from jawusd.media.masks import FrameMasks, MaskReader, open_masks
 from jawusd.media.working_view import WorkingView
 
 #: Minimum number of cameras if the depth of the teeth is determined only by masks.
@@ -117,10 +117,7 @@ class MaskViews:
             self._working.append(working)
             readers = open_masks(source, camera.size_px, prepare=working.mask)
             self._readers.append([self._stack.enter_context(reader) for reader in readers])
-        self.frames = (
-            min(self._offsets),
-            max(o + reader.count for o, pair in zip(self._offsets, self._readers, strict=True) for reader in pair),
-        )
+        self.frames = masked_frames(self._offsets, self._readers)
 
     def __enter__(self) -> MaskViews:
         return self
@@ -171,6 +168,11 @@ class MaskViews:
             while chunk:
                 yield chunk.pop()
             end, size = begin, min(2 * size, _CHUNK)
+
+
+def masked_frames(offsets: Sequence[int], readers: Sequence[Sequence[MaskReader]]) -> tuple[int, int]:
+    """Return the first frame in which any camera may have a mask, and one past the last."""
+    return min(offsets), max(o + reader.count for o, pair in zip(offsets, readers, strict=True) for reader in pair)
 
 
 def present_masks(views: Sequence[View]) -> Mask:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations, islice
 from math import comb
@@ -23,15 +23,16 @@ from jawusd.geometry import (
 )
 from jawusd.tracking.contour.equations import motion_about
 
-_FEWEST = 3
-# Distance between projected vertex and picked pixel above which a pick is rejected [mm at the teeth]: three times the
-# error of a careless click (5 px where a pixel is 0.07 mm).
+#: Minimum number of picks on an arch.
+FEWEST_PICKS = 3
+#: Distance between projected vertex and picked pixel above which a pick is rejected [mm at the teeth]: three times the
+#: error of a careless click (5 px where a pixel is 0.07 mm).
 TOLERANCE_MM = 1.1
+#: Hint for scans of a wrong size.
+SIZE_HINT = "Check the scans' unit and scaling, and the square size of the calibration board."
 _CLICK_MM = TOLERANCE_MM / 3  # standard deviation of a careless click along each axis [mm]
 _GAP_MM = 0.8  # maximum distance between the lines of sight of a careless pick [mm]
-# Minimum relative error of the scan size, estimated from the picks, for it to explain their misfit [-]: clicks 0.4 mm
-# off, on vertices 40 mm apart, cause an error of 0.01.
-_SIZE_SHARE = 0.03
+_SIZE_SHARE = 0.03  # minimum relative error of the scan size that explains a misfit [-]: careless clicks cause 0.01
 _MOST_TRIPLES = 500  # maximum number of pick triples tried: more do not improve the consensus
 
 
@@ -48,25 +49,23 @@ class _Sighting:
 def pose_from_picks(
     picks: Sequence[Pick], vertices: Array, cameras: Mapping[str, Camera], arch: str
 ) -> tuple[Array, list[int]]:
-    """Return T_world_scan (4, 4) from the picks, and the numbers of rejected picks.
+    """Return T_world_scan (4, 4) from the picks, and the numbers, from 1, of rejected picks.
 
-    Pick numbers start at 1. `vertices` are those of the scan file [mm], shape (V, 3); `arch` is the arch's name for
-    messages.
+    `vertices` are those of the scan file [mm], shape (V, 3); `arch` is the arch's name for messages.
 
     Raises:
         TrackingError: too few picks, an invalid pick, or picks that contradict one another.
     """
-    if len(picks) < _FEWEST:
+    if len(picks) < FEWEST_PICKS:
         raise TrackingError(
-            f"bootstrap: {len(picks)} picks on the {arch} teeth; at least {_FEWEST} are needed",
+            f"bootstrap: {len(picks)} picks on the {arch} teeth; at least {FEWEST_PICKS} are needed",
             hint="Pick more vertices, spread over the arch, each in at least two cameras.",
         )
-    sightings = [_sighting(k, pick, vertices, cameras, arch) for k, pick in enumerate(picks, start=1)]
-    places = np.stack([triangulate(s.matrices, s.pixels) for s in sightings])
-    points = np.stack([s.point for s in sightings])
+    sightings = _sightings(picks, vertices, cameras, arch)
+    points, places = _triangulated(sightings)
     best, best_cost = None, np.inf
-    step = max(1, comb(len(picks), _FEWEST) // _MOST_TRIPLES)
-    for triple in islice(combinations(range(len(picks)), _FEWEST), 0, None, step):
+    step = max(1, comb(len(picks), FEWEST_PICKS) // _MOST_TRIPLES)
+    for triple in islice(combinations(range(len(picks)), FEWEST_PICKS), 0, None, step):
         k = list(triple)
         try:
             pose = rigid_fit(points[k], places[k])
@@ -82,14 +81,14 @@ def pose_from_picks(
         )
     for _ in range(3):
         good = [s for s in sightings if _miss_mm(s, best) < TOLERANCE_MM]
-        if len(good) < _FEWEST:
-            if (size := _other_size(sightings, places)) is not None:
+        if len(good) < FEWEST_PICKS:
+            if (size := _other_size(sightings)) is not None:
                 raise TrackingError(
                     f"bootstrap: the picks on the {arch} teeth contradict one another, but agree with a scan "
-                    f"{_than(1 / size)}: the scale of the scans or of the calibration is wrong",
-                    hint="Check the scans' unit and scaling, and the square size of the calibration board.",
+                    f"{than(1 / size - 1)}: the scale of the scans or of the calibration is wrong",
+                    hint=SIZE_HINT,
                 )
-            if (cause := _wrong_sight(picks, vertices, cameras, arch, places, sightings)) is not None:
+            if (cause := _wrong_sight(picks, vertices, cameras, arch)) is not None:
                 raise TrackingError(
                     f"bootstrap: the picks on the {arch} teeth contradict one another: {cause}",
                     hint="Check the calibration and the picks' camera names, and that all views show the same frame.",
@@ -104,49 +103,29 @@ def pose_from_picks(
     return best, [s.number for s in sightings if s not in good]
 
 
-def _other_size(sightings: Sequence[_Sighting], places: Array) -> float | None:
-    """Return the factor by which the scan is too large if that explains the misfit of the picks, otherwise None.
-
-    `places` are the triangulated picks in world coordinates [mm], shape (P, 3).
-    """
-    points = np.stack([s.point for s in sightings])
+def _other_size(sightings: Sequence[_Sighting]) -> float | None:
+    """Return the factor by which the scan is too large if that explains the misfit of the picks, otherwise None."""
+    points, places = _triangulated(sightings)
     spread, seen = (float(np.std(x - x.mean(0))) for x in (points, places))
     size = spread / max(seen, 1e-9)
-    if len(sightings) <= _FEWEST or abs(size - 1.0) < _SIZE_SHARE:
+    if len(sightings) <= FEWEST_PICKS or abs(size - 1.0) < _SIZE_SHARE:
         return None
     pose = rigid_fit(points / size, places)
     fits = all(_miss_mm(replace(s, point=s.point / size), pose) < TOLERANCE_MM for s in sightings)
     return size if fits else None
 
 
-def _wrong_sight(
-    picks: Sequence[Pick],
-    vertices: Array,
-    cameras: Mapping[str, Camera],
-    arch: str,
-    places: Array,
-    sightings: Sequence[_Sighting],
-) -> str | None:
-    """Describe swapped cameras or lines of sight that do not meet, if they explain the misfit of the picks, or None.
-
-    `places` are the triangulated picks in world coordinates [mm], shape (P, 3).
-    """
+def _wrong_sight(picks: Sequence[Pick], vertices: Array, cameras: Mapping[str, Camera], arch: str) -> str | None:
+    """Describe swapped cameras or lines of sight that do not meet, if they explain the misfit of the picks, or None."""
     for a, b in combinations(cameras, 2):
-        other = {a: b, b: a}
-        renamed = [
-            Pick(
-                vertex=pick.vertex,
-                views=tuple(v.model_copy(update={"camera": other.get(v.camera, v.camera)}) for v in pick.views),
-            )
-            for pick in picks
-        ]
-        seen = [_sighting(k, pick, vertices, cameras, arch) for k, pick in enumerate(renamed, start=1)]
-        points, meets = np.stack([s.point for s in seen]), np.stack([triangulate(s.matrices, s.pixels) for s in seen])
-        pose = rigid_fit(points, meets)
+        seen = _sightings(exchanged(picks, a, b), vertices, cameras, arch)
+        pose = rigid_fit(*_triangulated(seen))
         if all(_miss_mm(s, pose) < TOLERANCE_MM for s in seen):
             return f"cameras {a} and {b} are exchanged, in the picks or in the calibration"
     # Lines of sight of neighbouring cameras may meet even if different points at the same height were picked.
-    gaps = [_miss_mm(replace(s, point=place), np.eye(4)) for s, place in zip(sightings, places, strict=True)]
+    seen = _sightings(picks, vertices, cameras, arch)
+    places = _triangulated(seen)[1]
+    gaps = [_miss_mm(replace(s, point=place), np.eye(4)) for s, place in zip(seen, places, strict=True)]
     if float(np.median(gaps)) < _GAP_MM:
         return None
     return (
@@ -155,26 +134,36 @@ def _wrong_sight(
     )
 
 
-def _than(ratio: float) -> str:
-    """Format a size ratio as "2.0% larger" or "2.0% smaller"."""
-    return f"{abs(ratio - 1.0):.1%} {'larger' if ratio > 1.0 else 'smaller'}"
+def with_cameras(picks: Sequence[Pick], renamed: Callable[[list[str]], list[str]]) -> list[Pick]:
+    """Return picks with the cameras of their views renamed."""
+    out = []
+    for pick in picks:
+        names = renamed([view.camera for view in pick.views])
+        views = [v.model_copy(update={"camera": name}) for v, name in zip(pick.views, names, strict=True)]
+        out.append(pick.model_copy(update={"views": tuple(views)}))
+    return out
+
+
+def exchanged(picks: Sequence[Pick], a: str, b: str) -> list[Pick]:
+    """Return picks with two cameras exchanged in their views."""
+    other = {a: b, b: a}
+    return with_cameras(picks, lambda names: [other.get(name, name) for name in names])
+
+
+def than(share: float) -> str:
+    """Format a relative difference of sizes as "2.0% larger" or "2.0% smaller"."""
+    return f"{abs(share):.1%} {'larger' if share > 0 else 'smaller'}"
 
 
 def picked_sigma_mm(
-    picks: Sequence[Pick],
-    vertices: Array,
-    cameras: Mapping[str, Camera],
-    pose: Array,
-    probes: Array,
+    picks: Sequence[Pick], vertices: Array, cameras: Mapping[str, Camera], pose: Array, probes: Array
 ) -> float:
-    """Return the rms position uncertainty of the crowns [mm], assuming careless clicks.
+    """Return the rms position uncertainty of the crowns at T_world_scan (4, 4) [mm], assuming careless clicks.
 
-    `picks` are those from which the pose T_world_scan, shape (4, 4), was computed; `probes` are points spread over the
-    crowns, scan coordinates [mm], shape (N, 3).
+    `probes` are points spread over the crowns, scan coordinates [mm], shape (N, 3).
     """
     H = np.zeros((6, 6))
-    for k, pick in enumerate(picks, start=1):
-        s = _sighting(k, pick, vertices, cameras, "picked")
+    for s in _sightings(picks, vertices, cameras):
         _, _, slope = _residuals_px(s, pose)
         px_per_mm = np.linalg.norm(slope, axis=(1, 2)) / np.sqrt(2)
         slope = (slope / (px_per_mm * _CLICK_MM)[:, None, None]).reshape(-1, 3)
@@ -187,8 +176,7 @@ def picked_sigma_mm(
 
 def picks_miss_mm(picks: Sequence[Pick], vertices: Array, cameras: Mapping[str, Camera], pose: Array) -> Array:
     """Return the error of each pick at T_world_scan (4, 4), measured at the vertex [mm], shape (P,)."""
-    sightings = [_sighting(k, pick, vertices, cameras, "picked") for k, pick in enumerate(picks, start=1)]
-    return np.array([_miss_mm(s, pose) for s in sightings])
+    return np.array([_miss_mm(s, pose) for s in _sightings(picks, vertices, cameras)])
 
 
 def picked_size(
@@ -196,16 +184,11 @@ def picked_size(
 ) -> tuple[float, float]:
     """Return the size ratio of scans to triangulated picks, and its standard deviation for careless clicks [-].
 
-    `picks` and `vertices` are those of the upper and the lower scan.
-
-    Raises:
-        TrackingError: an invalid pick.
+    `picks` and `vertices` are those of the upper and the lower scan. Raises TrackingError for an invalid pick.
     """
     product, square = 0.0, 0.0
     for own, points in zip(picks, vertices, strict=True):
-        sightings = [_sighting(k, pick, points, cameras, "picked") for k, pick in enumerate(own, start=1)]
-        places = np.stack([triangulate(s.matrices, s.pixels) for s in sightings])
-        given = np.stack([s.point for s in sightings])
+        given, places = _triangulated(_sightings(own, points, cameras))
         given = given - given.mean(0)
         try:
             turned = given @ rigid_fit(given, places)[:3, :3].T
@@ -214,6 +197,26 @@ def picked_size(
         product += float((turned * (places - places.mean(0))).sum())
         square += float((turned**2).sum())
     return square / max(product, 1e-9), _CLICK_MM / np.sqrt(max(square, 1e-9))
+
+
+def placed(picks: Sequence[Pick], vertices: Array, cameras: Mapping[str, Camera]) -> Array | None:
+    """Return T_world_scan (4, 4) from the triangulated picks; None if the picks lie on a line."""
+    try:
+        return rigid_fit(*_triangulated(_sightings(picks, vertices, cameras)))
+    except ValueError:
+        return None
+
+
+def _sightings(
+    picks: Sequence[Pick], vertices: Array, cameras: Mapping[str, Camera], arch: str = "picked"
+) -> list[_Sighting]:
+    return [_sighting(k, pick, vertices, cameras, arch) for k, pick in enumerate(picks, start=1)]
+
+
+def _triangulated(sightings: Sequence[_Sighting]) -> tuple[Array, Array]:
+    """Return the picked points in scan coordinates, and triangulated in the world [mm], shape (P, 3) each."""
+    places = [triangulate(s.matrices, s.pixels) for s in sightings]
+    return np.stack([s.point for s in sightings]), np.stack(places)
 
 
 def _sighting(number: int, pick: Pick, vertices: Array, cameras: Mapping[str, Camera], arch: str) -> _Sighting:

@@ -22,9 +22,11 @@ from jawusd.tracking.initialization.magnification import magnified, measure_magn
 #: Minimum `arch_fit` of a first frame [-]: wrong poses stay below it; correct poses exceed it, even with most lower
 #: teeth hidden.
 LEAST_FIT = 0.03
-# Minimum `arch_fit` [-] of a first frame that fits only without one of the cameras: an unambiguous fit, as in
-# `start_causes.CLEAR_FIT`.
-_CLEAR_FIT = 0.3
+#: Minimum fit that counts as clear [-]: correct poses exceed it unless lips are nearly closed; wrong poses stay below
+#: 0.1 in one arch.
+CLEAR_FIT = 0.3
+#: Minimum acceptable fit with a mistake corrected [-]: wrong poses do not reach it.
+EXPLAINS = 0.1
 # Minimum magnification error of a camera for it to explain a failed start [-]; minimum deviation from the other cameras
 # for it to be corrected [-]; and number of iterations, since contours far from their masks are not matched at first.
 _LEAST_SCALE, _OWN_SCALE, _SIZE_ROUNDS = 0.02, 0.015, 3
@@ -60,8 +62,9 @@ def first_record(
     first = _aligned(solver, config, start, views, use)
     if (problem := _problem(first, config)) is not None:
         # Wrong masks of one camera (another position, size or time) may have biased all poses.
-        others = [_aligned(solver, config, start, views, _without_camera(use, c)) for c in range(len(views))]
-        clear = [one for one in others if one.fit.min() >= _CLEAR_FIT and _problem(one, config) is None]
+        kept = [_without(use, np.arange(len(views)) == c) for c in range(len(views))]
+        others = [_aligned(solver, config, start, views, rest) for rest in kept]
+        clear = [one for one in others if one.fit.min() >= CLEAR_FIT and _problem(one, config) is None]
         if not clear:
             if explain and (cause := _wrong_size(solver, config, start, views)) is not None:
                 raise TrackingError(cause, frame=frame, hint=_SIZE_HINT)
@@ -95,7 +98,7 @@ def _aligned(solver: ContourSolver, config: TrackingConfig, start: Array, views:
         best = solver.solve(poses, views, config.wide_gates_px[-2:], use)
     coverage = coverage_error(*uncovered_px(solver.scans, best.poses, views))
     for _ in range(2):  # exclude uncovered masks, and include previously excluded ones that are now covered
-        kept = _without_spoiled(whole, coverage, config.lost_coverage)
+        kept = _without(whole, coverage > config.lost_coverage)  # an arch aligned with such a mask would be lost
         if (kept == use).all():
             break
         use = kept
@@ -134,7 +137,7 @@ def _wrong_size(solver: ContourSolver, config: TrackingConfig, start: Array, vie
         grown = [magnified(view, 1.0 + scale) for view, scale in zip(views, scales, strict=True)]
         again = _aligned(solver, config, poses, grown, use)
         poses = again.solution.poses
-    if np.abs(scales).max() > _LEAST_SCALE and _problem(again, config) is None and again.fit.min() >= _CLEAR_FIT:
+    if np.abs(scales).max() > _LEAST_SCALE and _problem(again, config) is None and again.fit.min() >= CLEAR_FIT:
         worst = int(np.abs(scales).argmax())
         return (
             f"camera {worst + 1} of {len(views)} magnifies the teeth by {100 * scales[worst]:+.1f} % relative to the "
@@ -143,18 +146,7 @@ def _wrong_size(solver: ContourSolver, config: TrackingConfig, start: Array, vie
     return None
 
 
-def _without_camera(use: Mask, camera: int) -> Mask:
-    """Exclude the masks of a camera for each arch that has enough masks without it; return the masks kept (2, C)."""
-    kept = use.copy()
-    kept[:, camera] = False
-    return np.where(kept.sum(1, keepdims=True) >= FEWEST_MASKS, kept, use)
-
-
-def _without_spoiled(use: Mask, coverage: Array, limit: float) -> Mask:
-    """Exclude uncovered masks of arches that have at least two covered ones; return the masks kept (2, C).
-
-    The limit on the uncovered fraction is the one for lost arches: an arch aligned with an excluded mask would be lost
-    in every frame.
-    """
-    kept = use & ~(coverage > limit)
+def _without(use: Mask, left_out: Mask) -> Mask:
+    """Return the masks (2, C) without some of them, except for arches that would have too few masks."""
+    kept = use & ~left_out
     return np.where(kept.sum(1, keepdims=True) >= FEWEST_MASKS, kept, use)

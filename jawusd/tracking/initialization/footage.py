@@ -15,7 +15,7 @@ from jawusd.formats.capture import CameraSource
 from jawusd.geometry import Camera, triangulate
 from jawusd.media.masks import open_masks
 from jawusd.media.working_view import WorkingView
-from jawusd.tracking.contour.views import FEWEST_CAMERAS, MaskSource, MaskViews
+from jawusd.tracking.contour.views import FEWEST_CAMERAS, MaskSource, MaskViews, masked_frames
 
 _BESIDE = 2  # number of surveyed frames on either side of a chosen frame to skip as redundant
 # Maximum ratio of the area of a plausible mask to that of masks known to be correct: an opening mouth shows more teeth.
@@ -42,8 +42,45 @@ class Footage:
         return [source for source in self.sources if isinstance(source, CameraSource)]
 
     def survey(self, frames: tuple[int, int] | None, count: int) -> MaskSurvey:
-        """Measure the masks of `count` evenly spaced frames, by default from the whole footage."""
-        return survey_masks(self.sources, self.cameras, self.offsets, frames or self.frames, count, self.fewest)
+        """Measure the masks of at most `count` evenly spaced frames, by default from the whole footage.
+
+        Raises:
+            TrackingError: no surveyed frame has masks of both arches in enough cameras.
+            CaptureError: a mask cannot be read.
+        """
+        with ExitStack() as stack:
+            working, readers = [], []
+            for source in self.sources:
+                camera = self.cameras[source.name]
+                width, height = camera.size_px
+                scale = min(1.0, _WIDTH_PX / max(width, height))
+                view = WorkingView(camera, (max(1, round(width * scale)), max(1, round(height * scale))))
+                working.append(view)
+                opened = open_masks(source, camera.size_px, prepare=view.mask)
+                readers.append([stack.enter_context(reader) for reader in opened])
+            shifts = [self.offsets[source.name] for source in self.sources]
+            first, stop = frames or self.frames or masked_frames(shifts, readers)
+            chosen = np.unique(np.linspace(first, stop - 1, min(count, stop - first)).round().astype(np.int64))
+            middles = np.full((len(chosen), 2, len(self.sources), 2), np.nan)
+            areas = np.zeros((len(chosen), 2, len(self.sources)))
+            for f, c, r in np.ndindex(len(chosen), len(self.sources), 2):
+                mask = readers[c][r].read(int(chosen[f]) - shifts[c])
+                if mask is not None and (area := float(mask.sum(dtype=np.float64)) / 255.0) > 1.0:
+                    rows, columns = mask.sum(1, dtype=np.float64), mask.sum(0, dtype=np.float64)
+                    middles[f, r, c] = [
+                        columns @ np.arange(len(columns)) / columns.sum(),
+                        rows @ np.arange(len(rows)) / rows.sum(),
+                    ]
+                    areas[f, r, c] = area
+        if not ((areas > 0).sum(-1) >= self.fewest).all(-1).any():
+            raise TrackingError(
+                f"none of {len(chosen)} frames sampled from {chosen[0]} to {chosen[-1]} has masks of both arches "
+                f"in {self.fewest} camera{'s' if self.fewest > 1 else ''}",
+                hint="Segment some frames in every camera, or add [bootstrap] picks on a segmented frame.",
+            )
+        matrices = np.stack([view.camera.projection_matrix() for view in working])
+        eyes = np.stack([view.camera.centre_world() for view in working])
+        return MaskSurvey(chosen, middles, areas, matrices, eyes, self.fewest)
 
     def views(self, centre: Array, px_per_mm: float) -> MaskViews:
         """Open the masks, scaled to a given resolution at the teeth, which are near world point `centre` (3,) [mm]."""
@@ -84,11 +121,8 @@ class MaskSurvey:
         """Return at most `count` frames with large masks of both arches in all cameras, the best first.
 
         Areas are clipped at their 90 % quantile, since larger masks may be wrong. Neighbouring frames are redundant, so
-        they come after all others.
-
-        Args:
-            count: maximum number of frames.
-            usual_px: areas of correct masks [px], shape (2, C); far larger masks count as missing.
+        they come after all others. Masks far larger than `usual_px`, the areas of correct masks (2, C), count as
+        missing.
         """
         areas_px = self.areas_px
         if usual_px is not None:
@@ -102,60 +136,3 @@ class MaskSurvey:
             if usable[f]:
                 (beside if any(abs(f - g) <= _BESIDE for g in apart) else apart).append(f)
         return self.frames[[*apart, *beside][:count]]
-
-
-def survey_masks(
-    sources: Sequence[MaskSource],
-    cameras: Mapping[str, Camera],
-    offsets: Mapping[str, int],
-    frames: tuple[int, int] | None,
-    count: int,
-    fewest: int = FEWEST_CAMERAS,
-) -> MaskSurvey:
-    """Measure the masks of at most `count` evenly spaced frames; other arguments are as in `Footage`.
-
-    Raises:
-        TrackingError: no surveyed frame has masks of both arches in enough cameras.
-        CaptureError: a mask cannot be read.
-    """
-    with ExitStack() as stack:
-        working, readers = [], []
-        for source in sources:
-            camera = cameras[source.name]
-            width, height = camera.size_px
-            scale = min(1.0, _WIDTH_PX / max(width, height))
-            view = WorkingView(camera, (max(1, round(width * scale)), max(1, round(height * scale))))
-            working.append(view)
-            opened = open_masks(source, camera.size_px, prepare=view.mask)
-            readers.append([stack.enter_context(reader) for reader in opened])
-        shifts = [offsets[source.name] for source in sources]
-        first, stop = frames or (
-            min(shifts),
-            max(o + reader.count for o, pair in zip(shifts, readers, strict=True) for reader in pair),
-        )
-        chosen = np.unique(np.linspace(first, stop - 1, min(count, stop - first)).round().astype(np.int64))
-        middles = np.full((len(chosen), 2, len(sources), 2), np.nan)
-        areas = np.zeros((len(chosen), 2, len(sources)))
-        for f, c, r in np.ndindex(len(chosen), len(sources), 2):
-            mask = readers[c][r].read(int(chosen[f]) - shifts[c])
-            if mask is not None and (area := float(mask.sum(dtype=np.float64)) / 255.0) > 1.0:
-                rows, columns = mask.sum(1, dtype=np.float64), mask.sum(0, dtype=np.float64)
-                middles[f, r, c] = [
-                    columns @ np.arange(len(columns)) / columns.sum(),
-                    rows @ np.arange(len(rows)) / rows.sum(),
-                ]
-                areas[f, r, c] = area
-    if not ((areas > 0).sum(-1) >= fewest).all(-1).any():
-        raise TrackingError(
-            f"none of {len(chosen)} frames sampled from {chosen[0]} to {chosen[-1]} has masks of both arches "
-            f"in {fewest} camera{'s' if fewest > 1 else ''}",
-            hint="Segment some frames in every camera, or add [bootstrap] picks on a segmented frame.",
-        )
-    return MaskSurvey(
-        frames=chosen,
-        middles=middles,
-        areas_px=areas,
-        matrices=np.stack([view.camera.projection_matrix() for view in working]),
-        eyes=np.stack([view.camera.centre_world() for view in working]),
-        fewest=fewest,
-    )

@@ -21,10 +21,8 @@ from jawusd.tracking.contour.samples import HABITS, LENGTH, NX, NY, U, V, X, Z, 
 from jawusd.tracking.contour.scan import ARCHES, Scan
 from jawusd.tracking.contour.views import Drawn, View
 
-# Search distance around contours [px]: an error of 5 % in focal length shifts molars by 9 px at 7 px/mm.
-_REACH_PX = 16.0
-# Distance from the optical axis at which distortion is reported [mm]: the distance of the outermost visible teeth.
-_RADIUS_MM = 25.0
+_REACH_PX = 16.0  # search distance around contours [px]: an error of 5 % in focal length shifts molars by 9 px
+_RADIUS_MM = 25.0  # distance from the optical axis at which distortion is reported [mm]: the outermost visible teeth
 # Prior standard deviations: magnification and distortion [-], rotation [rad] and motion [mm] of a camera per axis,
 # outline bias [px].
 _PRIORS = (0.1, 0.1, *(0.01,) * 3, *(2.0,) * 3, 1.0, 1.0)

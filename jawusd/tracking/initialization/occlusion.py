@@ -22,9 +22,7 @@ _CELL_MM = 1.0
 _THROUGH_MM = 2.0  # minimum vertical overlap of arches that passed through one another [mm]; cusps overlap less
 _SLAB_MM = 3.0
 _FEWEST = 50  # minimum number of surface samples for a side of an arch to be measured
-# minimum distance from the midline for a crown point to count as left or right: nearer points may be on the central
-# incisors
-_ASIDE_MM = 6.0
+_ASIDE_MM = 6.0  # minimum distance from the midline of points left or right: nearer ones may be on central incisors
 _OPEN = 0.08  # minimum ratio of vector area to area for a surface to count as open [-]
 # Limits for the gum to indicate the orientation of a scan: minimum area relative to the crowns [-], and minimum
 # vertical distance from the crowns [mm].
@@ -83,7 +81,6 @@ def measure_occlusion(scans: Sequence[Scan], T_anatomical_scan: Array) -> Occlus
     stand = [_beside(a, b) for a, b in ((upper, lower), (lower, upper))]
     deep = sum(float(surfaces[k].areas[d < -_DEEP_MM].sum()) for k, d in enumerate(signed))
     opposed = sum(float(surfaces[k].areas.sum() * stand[k].mean()) for k in (0, 1))
-    turned_over = (_turned_over(scans[0], surfaces[0], -normal), _turned_over(scans[1], surfaces[1], normal))
     midlines_mm, width_ratio = _compare_widths(upper, lower)
     return Occlusion(
         gap_mm=max(0.0, min(nearest)),
@@ -94,8 +91,8 @@ def measure_occlusion(scans: Sequence[Scan], T_anatomical_scan: Array) -> Occlus
         same=float(np.mean(np.abs(signed[1]) < _SAME_MM)),
         opposite=float(max(part.mean() for part in stand)),
         aside_mm=float(np.linalg.norm((upper.mean(0) - lower.mean(0))[[0, 2]])),
-        turn_rad=_angle(_forward(upper[:, [0, 2]]), _forward(lower[:, [0, 2]])),
-        turned_over=turned_over,
+        turn_rad=float(np.arccos(np.clip(_forward(upper[:, [0, 2]]) @ _forward(lower[:, [0, 2]]), -1.0, 1.0))),
+        turned_over=(_turned_over(scans[0], surfaces[0], -normal), _turned_over(scans[1], surfaces[1], normal)),
         opens_towards=(_opens_towards(surfaces[0], -normal), _opens_towards(surfaces[1], normal)),
         midlines_mm=midlines_mm,
         width_ratio=width_ratio,
@@ -125,11 +122,7 @@ def _signed_distances(these: CrownSurface, others: CrownSurface) -> Array:
 
 
 def _through(upper: Array, lower: Array) -> float:
-    """Return the fraction of the common area in the occlusal plane where lower crowns reach far above the upper ones.
-
-    Args:
-        upper, lower: crown points (left, up, front) [mm], shapes (N, 3) and (M, 3).
-    """
+    """Return `Occlusion.through` for crown points (left, up, front) [mm], shapes (N, 3) and (M, 3)."""
     ends = []
     for points, keep in ((upper, np.minimum), (lower, np.maximum)):
         cells, index = np.unique(np.floor(points[:, [0, 2]] / _CELL_MM).astype(int), axis=0, return_inverse=True)
@@ -210,10 +203,6 @@ def _widest_mm(points: Array) -> float:
     return float(np.ptp(points @ axes[:2].T, axis=0).max())
 
 
-def _angle(a: Array, b: Array) -> float:
-    return float(np.arccos(np.clip(a @ b, -1.0, 1.0)))
-
-
 def _turned_over(scan: Scan, surface: CrownSurface, towards: Array) -> bool | None:
     """Return whether the gum lies between the crowns and the other arch; None without gum."""
     corners = scan.vertices[scan.gum_faces]
@@ -231,8 +220,7 @@ def _turned_over(scan: Scan, surface: CrownSurface, towards: Array) -> bool | No
 def _opens_towards(surface: CrownSurface, towards: Array) -> bool:
     """Return whether the open side of a surface faces the other arch.
 
-    The vector area (the integral of the normal) of an open surface points away from the opening, where crowns were cut
-    from the gum.
+    The vector area (the integral of the normal) of an open surface points away from the opening.
     """
     directed = (surface.normals * surface.areas[:, None]).sum(0) / surface.areas.sum()
     return bool(towards @ directed < -_OPEN)

@@ -5,9 +5,8 @@ Each candidate mistake is yielded with corrected inputs; `pick_checks` tests whe
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from itertools import combinations
 
 import numpy as np
@@ -15,38 +14,28 @@ from scipy.optimize import least_squares
 
 from jawusd.base.arrays import Array
 from jawusd.formats.capture import Pick
-from jawusd.geometry import Camera, rigid_fit, se3_exp, transform_points, triangulate
-from jawusd.tracking.initialization.bootstrap import picked_size
+from jawusd.geometry import Camera, se3_exp, transform_points
+from jawusd.tracking.initialization.bootstrap import SIZE_HINT, exchanged, picked_size, placed, than, with_cameras
 
-# minimum relative error of the scan size, estimated from the picks, for it to count as a possible mistake
-_SIZE_SHARE = 0.02
+_SIZE_SHARE = 0.02  # minimum relative error of the scan size, estimated from the picks, for it to be a possible mistake
 # Prior standard deviations of a camera's errors: shift as a fraction of the image width, and relative focal length; and
 # standard deviation of a click [mm].
 _SHIFT, _FOCAL, _CLICK_MM = 0.05, 0.1, 0.3
-# bound on the log of the focal-length factor, which random clicks would otherwise make overflow
-_MOST_ZOOM = np.log(2.0)
+_MOST_ZOOM = np.log(2.0)  # bound on the log of the focal-length factor, which would overflow for random clicks
 _STEP = np.array([0.1, 0.1, 0.1, 1.0, 1.0, 1.0])  # scale of the pose unknowns [rad, mm]: about their usual error
 
 
 @dataclass(frozen=True, eq=False)
 class Setting:
-    """All inputs that determine the projections of the scans, as given or with a mistake corrected.
+    """All inputs that determine the projections of the scans, as given or with a mistake corrected."""
 
-    Attributes:
-        picks: picks on the upper and on the lower arch.
-        vertices: vertices of both scans, as indexed by the picks [mm].
-        crowns: some points of both scans' crowns [mm].
-        cameras: calibrated cameras by name.
-        sources: for each camera name, the name of the camera whose masks it uses; by default, its own.
-        exchanged: cameras for which the masks of the two arches are swapped.
-    """
-
-    picks: tuple[Sequence[Pick], Sequence[Pick]]
-    vertices: tuple[Array, Array]
-    crowns: tuple[Array, Array]
-    cameras: Mapping[str, Camera]
+    picks: tuple[Sequence[Pick], Sequence[Pick]]  # picks on the upper and on the lower arch
+    vertices: tuple[Array, Array]  # vertices of both scans, as indexed by the picks [mm]
+    crowns: tuple[Array, Array]  # some points of both scans' crowns [mm]
+    cameras: Mapping[str, Camera]  # calibrated cameras by name
+    #: for each camera name, the name of the camera whose masks it uses; by default, its own
     sources: Mapping[str, str] = field(default_factory=dict)
-    exchanged: frozenset[str] = frozenset()
+    exchanged: frozenset[str] = frozenset()  # cameras for which the masks of the two arches are swapped
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,9 +64,9 @@ def possible_mistakes(given: Setting) -> Iterator[Mistake]:
     if abs(size - 1.0) > _SIZE_SHARE:
         yield Mistake(
             "scan_size",
-            f"the picks show teeth {abs(1.0 / size - 1.0):.1%} {'smaller' if size > 1.0 else 'larger'} than the scans: "
-            "the scale of the scans or of the calibration is wrong",
-            "Check the scans' unit and scaling, and the square size of the calibration board.",
+            f"the picks show teeth {than(1.0 / size - 1.0)} than the scans: the scale of the scans or of the "
+            "calibration is wrong",
+            SIZE_HINT,
             _with_scans(given, np.full(3, 1.0 / size)),
             True,
         )
@@ -98,11 +87,12 @@ def _exchanged_scans(given: Setting) -> Iterator[Mistake]:
 
 def _exchanges(given: Setting) -> Iterator[Mistake]:
     """Yield swaps of calibrations, of cameras in the picks, and of masks."""
+    upper, lower = (with_cameras(picks, lambda names: names[::-1]) for picks in given.picks)
     yield Mistake(
         "picks_views_exchanged",
         "the two cameras of the picks are exchanged",
         "Exchange the camera names within every pick of [bootstrap].",
-        replace(given, picks=_with_views(given, lambda names: names[::-1])),
+        replace(given, picks=(upper, lower)),
     )
     for a, b in combinations(given.cameras, 2):
         other = {a: b, b: a}
@@ -116,7 +106,7 @@ def _exchanges(given: Setting) -> Iterator[Mistake]:
             "picks_cameras_exchanged",
             f"cameras {a} and {b} are exchanged in the picks",
             "Exchange these names in [bootstrap].",
-            replace(given, picks=_with_views(given, partial(_renamed, other))),
+            replace(given, picks=(exchanged(given.picks[0], a, b), exchanged(given.picks[1], a, b))),
         )
         yield Mistake(
             "masks_cameras_exchanged",
@@ -127,8 +117,8 @@ def _exchanges(given: Setting) -> Iterator[Mistake]:
     hint = "Exchange masks.upper and masks.lower"
     for name in given.cameras:
         message = f"the masks of the upper and lower teeth are exchanged in camera {name}"
-        turned = replace(given, exchanged=frozenset([name]))
-        yield Mistake("masks_arches_exchanged", message, f"{hint} of camera {name}.", turned)
+        swapped = replace(given, exchanged=frozenset([name]))
+        yield Mistake("masks_arches_exchanged", message, f"{hint} of camera {name}.", swapped)
     yield Mistake(
         "masks_arches_exchanged",
         "the masks of the upper and lower teeth are exchanged in every camera",
@@ -140,22 +130,6 @@ def _exchanges(given: Setting) -> Iterator[Mistake]:
 def _with_scans(given: Setting, factors: Array) -> Setting:
     vertices, crowns = ((own[0] * factors, own[1] * factors) for own in (given.vertices, given.crowns))
     return replace(given, vertices=vertices, crowns=crowns)
-
-
-def _renamed(other: Mapping[str, str], names: list[str]) -> list[str]:
-    return [other.get(name, name) for name in names]
-
-
-def _with_views(given: Setting, renamed: Callable[[list[str]], list[str]]) -> tuple[Sequence[Pick], Sequence[Pick]]:
-    """Return the picks with the cameras of their views renamed."""
-
-    def changed(pick: Pick) -> Pick:
-        names = renamed([view.camera for view in pick.views])
-        views = [v.model_copy(update={"camera": name}) for v, name in zip(pick.views, names, strict=True)]
-        return pick.model_copy(update={"views": tuple(views)})
-
-    upper, lower = given.picks
-    return [changed(pick) for pick in upper], [changed(pick) for pick in lower]
 
 
 def _wrong_lenses(given: Setting) -> Iterator[Mistake]:
@@ -200,10 +174,9 @@ def fitted_camera(
     name: str,
     zooms: bool,
 ) -> Camera | None:
-    """Return a camera whose principal point or focal length is adjusted to fit the picks best.
+    """Return a camera whose principal point or focal length, with the poses of the scans, is adjusted to the picks.
 
-    Return None if no pick has a pixel in that camera, or if the picks of an arch lie on a line. `picks` and `vertices`
-    are those of the upper and the lower scan. The poses of the scans are fitted as well.
+    Return None if no pick has a pixel in that camera, or if the picks of an arch lie on a line.
     """
     if all(view.camera != name for own in picks for pick in own for view in pick.views):
         return None
@@ -215,9 +188,9 @@ def fitted_camera(
             return shifted(given, x[:2] * _SHIFT * width)
         return zoomed(given, float(np.exp(np.clip(x[0] * _FOCAL, -_MOST_ZOOM, _MOST_ZOOM))))
 
-    placed = [_placed(own, points, cameras) for own, points in zip(picks, vertices, strict=True)]
-    starts = [start for start in placed if start is not None]
-    if len(starts) < len(placed):
+    found = [placed(own, points, cameras) for own, points in zip(picks, vertices, strict=True)]
+    starts = [start for start in found if start is not None]
+    if len(starts) < len(found):
         return None
     sights = [_sights(own, points) for own, points in zip(picks, vertices, strict=True)]
 
@@ -230,21 +203,18 @@ def fitted_camera(
             about, middle, views = seen
             everything = transform_points(start, middle + transform_points(T, about))
             for camera_name, which, pixels in views:
-                camera, placed = table[camera_name], everything[which]
-                mm_per_px = camera.depth(placed) / float(camera.K[0, 0])
-                out.append(((camera.project(placed) - pixels) * mm_per_px[:, None] / _CLICK_MM).ravel())
+                camera, points = table[camera_name], everything[which]
+                mm_per_px = camera.depth(points) / float(camera.K[0, 0])
+                out.append(((camera.project(points) - pixels) * mm_per_px[:, None] / _CLICK_MM).ravel())
         return np.concatenate(out)
 
-    found = least_squares(residuals, np.zeros(14), method="lm", max_nfev=250)
-    return changed(found.x)
+    return changed(least_squares(residuals, np.zeros(14), method="lm", max_nfev=250).x)
 
 
 def _sights(picks: Sequence[Pick], vertices: Array) -> tuple[Array, Array, list[tuple[str, list[int], Array]]]:
-    """Return the picked points of a scan and their pixels.
+    """Return the picked points of a scan relative to their mean (P, 3), the mean (3,), and the pixels of each camera.
 
-    Returns:
-        the points relative to their mean (P, 3), the mean (3,), and for each camera the indices of its points and their
-            pixels (N, 2).
+    For each camera, the indices of its points are followed by their pixels (N, 2).
     """
     points = np.stack([vertices[pick.vertex] for pick in picks])
     middle = points.mean(axis=0)
@@ -254,18 +224,3 @@ def _sights(picks: Sequence[Pick], vertices: Array) -> tuple[Array, Array, list[
             seen.setdefault(view.camera, []).append((k, [view.x, view.y]))
     views = [(name, [k for k, _ in own], np.array([pixel for _, pixel in own])) for name, own in seen.items()]
     return points - middle, middle, views
-
-
-def _placed(picks: Sequence[Pick], vertices: Array, cameras: Mapping[str, Camera]) -> Array | None:
-    """Return T_world_scan (4, 4) from the triangulated picks; None if the picks lie on a line."""
-    places = [
-        triangulate(
-            np.stack([cameras[view.camera].projection_matrix() for view in pick.views]),
-            np.stack([cameras[view.camera].undistort_pixels([view.x, view.y]) for view in pick.views]),
-        )
-        for pick in picks
-    ]
-    try:
-        return rigid_fit(np.stack([vertices[pick.vertex] for pick in picks]), np.stack(places))
-    except ValueError:
-        return None

@@ -19,7 +19,7 @@ from jawusd.base.errors import TrackingError
 from jawusd.formats.finding import Finding, Severity
 from jawusd.geometry import transform_points
 from jawusd.tracking.contour.scan import ARCH_NAMES, ARCHES
-from jawusd.tracking.initialization.bootstrap import TOLERANCE_MM, picks_miss_mm, pose_from_picks
+from jawusd.tracking.initialization.bootstrap import FEWEST_PICKS, TOLERANCE_MM, picks_miss_mm, pose_from_picks
 from jawusd.tracking.initialization.pick_causes import Mistake, Setting, possible_mistakes
 
 _CLOSE_MM = 1.0  # maximum distance of a covered mask pixel from a projected crown point [mm]
@@ -32,17 +32,14 @@ _SUSPECT_MISFIT = 1.7
 _PROOF, _PROOF_BY_PICKS = 0.5, 0.75
 # fraction of mask pixels off the scans that adds 1 to the misfit, and rms pick error [mm] that adds 1
 _OFF, _MISS_MM = 0.05, 0.3
-# fraction of mask pixels off the scans that is assumed for a camera without masks in this frame, since its masks might
-# contradict the picks
-_UNSEEN = 0.25
+_UNSEEN = 0.25  # fraction of mask pixels off the scans that is assumed for a camera without masks in this frame
 _SURE = 1.0  # misfit below which swapped inputs are reported without testing for mistakes in single cameras
 _ALIKE = 0.15  # maximum difference of another mistake's misfit from the smallest one for it to be reported too
 # maximum number of mistakes tested: covers 15 cameras; the 6,000 mistakes of 64 cameras would take most of an hour
 _MOST_TRIED = 400
-_FEWEST = 3  # minimum number of picks on an arch
 
-#: Function that returns the mask pixels of both arches in the frame of the picks, shape (N, 2) each, N = 0 without a
-#: mask. Arguments: name of the camera whose masks are read, and name of the camera whose frame numbers are used.
+#: Returns the mask pixels of both arches in the frame of the picks, shape (N, 2) each, given the names of the camera
+#: whose masks are read and of the camera whose frame numbers are used.
 Seen = Callable[[str, str], tuple[Array, Array]]
 
 
@@ -53,7 +50,6 @@ def pick_findings(given: Setting, seen: Sequence[Seen], masked: Sequence[str], f
         given: the inputs as in the capture.
         seen: readers of the masks, one per candidate set of time offsets.
         masked: cameras that have masks.
-        frame: frame number of the picks, for the findings.
 
     Raises:
         TrackingError: the picks contradict one another, and no single mistake explains it.
@@ -114,12 +110,9 @@ class _Evidence:
 
 
 def _evidence(setting: Setting, seen: Sequence[Seen], masked: Sequence[str]) -> _Evidence:
-    """Estimate poses from the picks in `setting`, and measure how well the masks of `masked` cameras agree.
+    """Estimate poses from the picks, and measure how well the masks agree; raises TrackingError if the picks do not.
 
-    `seen` reads the masks for each candidate set of time offsets; for each camera, the best candidate is used.
-
-    Raises:
-        TrackingError: the picks contradict one another.
+    For each camera, the best candidate time offset of `seen` is used.
     """
     poses, wrong, misses = [], {}, []
     for picks, vertices, name in zip(setting.picks, setting.vertices, ARCH_NAMES, strict=True):
@@ -191,15 +184,8 @@ def _explained(mistake: Mistake, undone: _Evidence, found: _Evidence | None, fra
     as_given = "the picks contradict one another" if found is None else _summary(found)
     message = f"{mistake.message}; as given, {as_given}; once corrected, {_summary(undone)}"
     severity: Severity = "warning" if mistake.correctable and found is not None else "error"
-    return Finding(
-        mistake.kind,
-        severity,
-        message,
-        value=None if found is None else round(found.misfit, 2),
-        camera=mistake.camera,
-        frame=frame,
-        hint=mistake.hint,
-    )
+    value = None if found is None else round(found.misfit, 2)
+    return Finding(mistake.kind, severity, message, value, camera=mistake.camera, frame=frame, hint=mistake.hint)
 
 
 def _summary(found: _Evidence) -> str:
@@ -220,6 +206,6 @@ def _valid(given: Setting) -> bool:
     for picks, vertices in zip(given.picks, given.vertices, strict=True):
         cameras = [{view.camera for view in pick.views} for pick in picks]
         known = all(len(own) >= 2 and own <= set(given.cameras) for own in cameras)
-        if len(picks) < _FEWEST or not known or any(pick.vertex >= len(vertices) for pick in picks):
+        if len(picks) < FEWEST_PICKS or not known or any(pick.vertex >= len(vertices) for pick in picks):
             return False
     return True

@@ -29,19 +29,13 @@ _UNCOVERED_PRICE = 1.0  # penalty per mm^2 of uncovered mask, in mm of matched o
 
 @dataclass(frozen=True)
 class Grid:
-    """A grid of poses around a guess.
+    """A grid of poses around a guess."""
 
-    Attributes:
-        yaw_rad, pitch_rad, roll_rad: rotations about the up, left and front axes of the arch.
-        reach_mm: maximum translation along the left, up and front axes, in both directions.
-        step_mm: spacing of the translations.
-    """
-
-    yaw_rad: Array
+    yaw_rad: Array  # rotations about the up, left and front axes of the arch
     pitch_rad: Array
     roll_rad: Array
-    reach_mm: tuple[float, float, float]
-    step_mm: float = 1.5
+    reach_mm: tuple[float, float, float]  # maximum translation along the left, up and front axes, in both directions
+    step_mm: float = 1.5  # spacing of the translations
 
     def turns(self) -> Iterator[Array]:
         """Yield the rotations in batches (N, 3, 3): all roll angles of one yaw and pitch."""
@@ -123,12 +117,9 @@ def search_arch(
     """Return the best translation of every orientation of a grid, the best orientations first.
 
     Args:
-        scan: coarse scan of the arch.
-        arch: 0 upper, 1 lower.
-        views: views of one frame; those without a mask of the arch are ignored.
+        scan: coarse scan of the arch; views without a mask of it are ignored.
         px_per_mm: resolution of the views at the teeth.
-        base: guessed T_world_axes of (left, up, front) axes of the arch with origin at the centre of rotation, shape
-            (4, 4).
+        base: guessed T_world_axes of (left, up, front) axes with origin at the centre of rotation, shape (4, 4).
         hinge: T_axes_scan, from the scan frame to the same axes, shape (4, 4).
         map_: distributes the orientations among threads.
     """
@@ -146,6 +137,20 @@ def search_arch(
 
     found = [candidate for some in map_(best_translations, grid.turns()) for candidate in some]
     return sorted(found, key=lambda c: -c.objective)
+
+
+def distinct(found: Sequence[Candidate], probes: Array, least_mm: float, most: int) -> list[Candidate]:
+    """Return the first `most` candidates with mean distances between their probes (N, 3) above `least_mm`."""
+    kept: list[Candidate] = []
+    places = np.empty((most, len(probes), 3))
+    for candidate in found:
+        here = transform_points(candidate.pose, probes)
+        if (np.linalg.norm(places[: len(kept)] - here, axis=-1).mean(1) > least_mm).all():
+            places[len(kept)] = here
+            kept.append(candidate)
+            if len(kept) == most:
+                break
+    return kept
 
 
 def _template(mask: NDArray[np.uint8], other: NDArray[np.uint8], px_per_mm: float) -> Array:
@@ -174,9 +179,7 @@ def _slope(matrix: Array, point: Array) -> Array:
 def hinge_at_front(crowns: Array, T_anatomical_scan: Array) -> Array:
     """Return the transform from the scan frame to anatomical axes at the centre of the front teeth, shape (4, 4).
 
-    Args:
-        crowns: crown vertices in the scan frame [mm], shape (N, 3).
-        T_anatomical_scan: scan to anatomical axes, shape (4, 4).
+    `crowns` are crown vertices in the scan frame [mm], shape (N, 3); `T_anatomical_scan` has shape (4, 4).
     """
     points = transform_points(T_anatomical_scan, crowns)
     # front teeth up to the first premolars, which are usually visible
@@ -185,13 +188,11 @@ def hinge_at_front(crowns: Array, T_anatomical_scan: Array) -> Array:
 
 
 def shift_to_masks(scan: Scan, pose: Array, arch: int, views: Sequence[View], use: Mask) -> Array:
-    """Return the translation perpendicular to the line of sight that aligns the centres of crowns and masks [mm].
+    """Return the translation (3,) perpendicular to the line of sight that aligns the centres of crowns and masks [mm].
 
-    The translation moves teeth that were out of view close to their masks. Lips hide different teeth in every view, so
-    a depth estimate would be off by a centimetre or two; depth is therefore not changed. Perpendicular to the line of
-    sight, the result is accurate to a few millimetres, enough to start a search.
-
-    `pose` is T_world_scan, `use` the masks to use, shape (2, C). Without masks, the translation is zero.
+    It moves teeth that were out of view close to their masks. Depth is not changed: lips hide different teeth in every
+    view, so an estimate would be off by a centimetre or two. `pose` is T_world_scan, `use` the masks to use, shape (2,
+    C). Without masks, the translation is zero.
     """
     centre = np.append(transform_point(pose, scan.centre), 1.0)
     H, g, sight = np.zeros((3, 3)), np.zeros(3), np.zeros(3)

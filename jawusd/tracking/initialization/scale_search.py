@@ -21,6 +21,7 @@ from jawusd.tracking.contour.quality import arch_fit, score_px, uncovered_px
 from jawusd.tracking.contour.scan import ARCH_NAMES, prepare_scan, teeth_centre
 from jawusd.tracking.contour.solver import ContourSolver
 from jawusd.tracking.contour.views import masked_sources
+from jawusd.tracking.initialization.first_frame import CLEAR_FIT
 from jawusd.tracking.initialization.footage import Footage
 from jawusd.tracking.initialization.scan_checks import check_occlusion
 from jawusd.tracking.initialization.start_search import StartSearch
@@ -31,9 +32,7 @@ _STARTS = (1.0, 1 / 1.15, 1.15, 1 / 1.32, 1.32)
 _STEPS = (0.03, 0.01, 0.005)
 _SMALLEST, _LARGEST = 0.5, 2.0
 _SURVEYED, _FRAMES_TRIED = 24, 2
-# Maximum number of evaluations of a hill climb: the whole range in the widest steps, plus the finer steps.
-_MOST_SIZES = 64
-_CLEAR_FIT = 0.3  # minimum fit, as for the start of a take [-]: wrong poses stay below 0.1 in one arch
+_MOST_SIZES = 64  # maximum number of evaluations of a hill climb: the range in the widest steps, and the finer steps
 
 
 def seen_size(
@@ -46,7 +45,6 @@ def seen_size(
     """Return the size of the teeth in the calibrated world relative to the scans, accurate to 0.5 %.
 
     Args:
-        capture: provides masks, frame range and anatomical axes.
         cameras: calibrated up to the scale of the world.
         offsets: time offsets by camera name: the reference frame number minus the camera's own frame number.
         meshes: upper and lower teeth scans in one coordinate frame, in occlusion [mm].
@@ -68,12 +66,12 @@ def seen_size(
             except TrackingError:
                 continue
             size, fit = sizes.climb(frame, start, poses)
-            if fit >= _CLEAR_FIT:
+            if fit >= CLEAR_FIT:
                 return 1.0 / size  # teeth that appear too small indicate a world that is too small by the same factor
             best_fit = max(best_fit, fit)
     raise TrackingError(
         f"the scans do not fit the masks of frames {', '.join(map(str, frames))} at any size from {_SMALLEST:g} to "
-        f"{_LARGEST:g} (the best fit is {best_fit:.2f}; at least {_CLEAR_FIT} is needed)"
+        f"{_LARGEST:g} (the best fit is {best_fit:.2f}; at least {CLEAR_FIT} is needed)"
     )
 
 

@@ -62,27 +62,19 @@ def occlusion_findings(scans: Sequence[Scan], T_anatomical_scan: ArrayLike | Non
 
     Only impossible bites are errors; with an error, warnings are omitted, since they would be its consequences.
     """
-    given = T_anatomical_scan is not None
     derived = anatomical_frame(*(scan.crown_vertices(6000) for scan in scans))
     found = measure_occlusion(scans, derived)
     errors = list(_impossible(found))
     findings = errors[:1] or list(_unusual(found))
-    if not given:
+    if T_anatomical_scan is None:
         return derived, findings
     T = np.array(T_anatomical_scan, np.float64)
     tilt_deg = float(np.degrees(np.arccos(np.clip(T[1, :3] @ derived[1, :3], -1.0, 1.0))))
     if tilt_deg > _AXES_OFF_DEG and not errors:
-        findings.append(
-            Finding(
-                "anatomical_axes_off",
-                "warning",
-                f"the up axis of [anatomy] T_anatomical_skull is {tilt_deg:.0f} degrees off the normal of the "
-                f"occlusal plane; up to {_AXES_OFF_DEG:g} degrees is usual",
-                tilt_deg,
-                _AXES_OFF_DEG,
-                hint="Correct or remove T_anatomical_skull: without it the axes are derived from the scans.",
-            )
-        )
+        message = f"the up axis of [anatomy] T_anatomical_skull is {tilt_deg:.0f} degrees off the normal of the "
+        message += f"occlusal plane; up to {_AXES_OFF_DEG:g} degrees is usual"
+        hint = "Correct or remove T_anatomical_skull: without it the axes are derived from the scans."
+        findings.append(Finding("anatomical_axes_off", "warning", message, tilt_deg, _AXES_OFF_DEG, hint=hint))
     return T, findings
 
 
@@ -156,11 +148,9 @@ def _unusual(found: Occlusion) -> Iterator[Finding]:
         message += f"to {_RATIOS[1]:g} is usual): a crossbite, or scans of different scale"
         yield warning("arch_widths", message, found.width_ratio, _RATIOS[found.width_ratio > 1.0])
     if found.lower_ahead_mm > _LOWER_AHEAD_MM:
-        message = (
-            f"the lower front teeth are {found.lower_ahead_mm:.1f} mm in front of the upper ones: an underbite, or "
-        )
+        message = f"the lower front teeth are {found.lower_ahead_mm:.1f} mm in front of the upper ones: an underbite, "
         hint = "Check that the upper and the lower file in [scans] are not exchanged."
-        yield warning("underbite", message + "exchanged scan files", found.lower_ahead_mm, _LOWER_AHEAD_MM, hint)
+        yield warning("underbite", message + "or exchanged scan files", found.lower_ahead_mm, _LOWER_AHEAD_MM, hint)
     for k, name in enumerate(ARCH_NAMES):
         if found.opens_towards[k] and found.turned_over[k] is None:
             message = f"the open side of the {name} scan faces the other arch: it is upside down, or its faces are "

@@ -17,14 +17,12 @@ from jawusd.geometry import Camera, transform_point
 from jawusd.tracking.config import Mapper
 from jawusd.tracking.contour.solver import ContourSolver
 from jawusd.tracking.contour.views import masked_sources
-from jawusd.tracking.initialization.bootstrap import picked_sigma_mm, pose_from_picks
+from jawusd.tracking.initialization.bootstrap import SIZE_HINT, picked_sigma_mm, pose_from_picks
+from jawusd.tracking.initialization.first_frame import CLEAR_FIT, EXPLAINS
 from jawusd.tracking.initialization.footage import Footage
 from jawusd.tracking.initialization.scan_checks import check_occlusion
 from jawusd.tracking.initialization.start_causes import (
-    CLEAR_FIT,
-    EXPLAINS,
     MOST_PICTURES,
-    SIZE_HINT,
     aligned,
     all_arches_exchanged,
     likely_exchange,
@@ -52,12 +50,10 @@ class Start:
 def search_start(search: StartSearch, footage: Footage, suspects: Collection[str] = (), explain: bool = True) -> Start:
     """Find a frame on which both arches can be aligned, and their poses.
 
-    The first frame with a clear fit is used, otherwise the frame with the best fit. If neither arch fits acceptably on
-    the frame with the best fit, but both fit clearly once a mistake is corrected, that mistake is reported as an error.
+    The first frame with a clear fit is used, otherwise the frame with the best fit. If neither arch fits acceptably
+    there, but both fit clearly once a mistake is corrected, that mistake is reported as an error.
 
     Args:
-        search: search for the poses of the scans.
-        footage: the masks.
         suspects: hints of the mistakes that the scans suggest; a mistake is identified by its hint.
         explain: whether to look for a mistake if no frame fits, which takes several times as long.
 
@@ -112,8 +108,7 @@ def search_start(search: StartSearch, footage: Footage, suspects: Collection[str
 def search_near(search: StartSearch, footage: Footage, frame: int, poses: Array) -> SearchResult:
     """Search near given poses, and everywhere if none of them fits clearly.
 
-    Raises:
-        TrackingError: no anatomically possible pair of poses.
+    Raises TrackingError if no pair of poses is anatomically possible.
     """
     near = search.near(footage, frame, poses)
     if near.fit >= CLEAR_FIT:
@@ -128,17 +123,8 @@ def search_near(search: StartSearch, footage: Footage, frame: int, poses: Array)
 def fit_without_a_camera(
     search: StartSearch, footage: Footage, frame: int, poses: Array, found: SearchResult
 ) -> tuple[str, SearchResult] | None:
-    """Return a camera whose masks contradict the other cameras, and the poses found without it; otherwise None.
-
-    A camera is excluded only if the masks of the others then fit clearly.
-    """
-    if len(footage.sources) < 3:
-        return None
-    try:
-        aligned(search, footage, found.poses, frame)
-    except TrackingError:
-        pass
-    else:
+    """Return a camera whose masks contradict the others, which fit clearly without it, and their poses, or None."""
+    if len(footage.sources) < 3 or _fits(search, footage, found.poses, frame):
         return None
     better = []
     for source in footage.sources:
@@ -182,9 +168,7 @@ def find_start(
     """Return the first frame and its poses, from the capture's picks or, without picks, by search.
 
     Args:
-        capture: provides masks, picks and frame range.
-        cameras, offsets: calibrations and time offsets by camera name; an offset is the reference frame number minus
-            the camera's own.
+        offsets: time offsets by camera name: the reference frame number minus the camera's own.
         meshes: upper and lower teeth scans in one coordinate frame, in occlusion [mm].
         solver: solver prepared with the same scans.
         map_: distributes the search among threads.
@@ -208,11 +192,7 @@ def find_start(
 
 @contextlib.contextmanager
 def quote_findings(findings: Sequence[Finding]) -> Iterator[None]:
-    """Append findings, which may be the cause, to the hint of a TrackingError raised inside the context.
-
-    Raises:
-        TrackingError: the error raised inside, with the findings in its hint.
-    """
+    """Append findings, which may be the cause, to the hint of a TrackingError raised inside the context."""
     try:
         yield
     except TrackingError as error:
@@ -245,20 +225,22 @@ def _picked(
         raise exchange.error(start.frame)
     if not footage.has_masks(start.frame):
         return _elsewhere(search, footage, start, "the frame of the picks lacks masks of both arches in two cameras")
-    if max(sigma_mm.values()) <= _SURE_MM and _fits(search, footage, start):
+    if max(sigma_mm.values()) <= _SURE_MM and _fits(search, footage, start.poses, start.frame):
         return start
     try:
         found = search_near(search, footage, start.frame, start.poses)
     except TrackingError:
-        return start if _fits(search, footage, start) else _elsewhere(search, footage, start)
+        fits = _fits(search, footage, start.poses, start.frame)
+        return start if fits else _elsewhere(search, footage, start)
     if (without := fit_without_a_camera(search, footage, start.frame, start.poses, found)) is not None:
         notes["camera_left_out"], found = without
     searched = {"by": "picks, then search", "worth_px": found.objective_px, "fit": found.fit}
     near = Start(start.frame, found.poses, notes | searched, _picks_off(search, start, found.poses, sigma_mm))
-    if "camera_left_out" in notes or _fits(search, footage, near):
+    if "camera_left_out" in notes or _fits(search, footage, near.poses, near.frame):
         return near
     # The search may end in a wrong local minimum although the picks were nearly accurate enough.
-    return start if _fits(search, footage, start) else _elsewhere(search, footage, start)
+    fits = _fits(search, footage, start.poses, start.frame)
+    return start if fits else _elsewhere(search, footage, start)
 
 
 def _picks_off(search: StartSearch, start: Start, poses: Array, sigma_mm: Mapping[str, float]) -> tuple[Finding, ...]:
@@ -275,10 +257,7 @@ def _picks_off(search: StartSearch, start: Start, poses: Array, sigma_mm: Mappin
 
 
 def _elsewhere(
-    search: StartSearch,
-    footage: Footage,
-    start: Start,
-    reason: str = "the picks do not fit the masks of their frame",
+    search: StartSearch, footage: Footage, start: Start, reason: str = "the picks do not fit the masks of their frame"
 ) -> Start:
     """Return a start on another frame that fits, since lips may hide the teeth on the picked frame.
 
@@ -313,10 +292,10 @@ def _near_on_another_frame(search: StartSearch, footage: Footage, start: Start) 
     return None
 
 
-def _fits(search: StartSearch, footage: Footage, start: Start) -> bool:
-    """Return whether a start passes the checks of a first frame; with hidden teeth, it may be a wrong local minimum."""
+def _fits(search: StartSearch, footage: Footage, poses: Array, frame: int) -> bool:
+    """Return whether poses pass the checks of a first frame; with hidden teeth, they may be a wrong local minimum."""
     try:
-        aligned(search, footage, start.poses, start.frame)
+        aligned(search, footage, poses, frame)
     except TrackingError:
         return False
     return True

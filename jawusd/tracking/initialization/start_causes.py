@@ -14,15 +14,14 @@ from jawusd.formats.capture_parts import CameraSource, Masks
 from jawusd.tracking.contour.quality import coverage_error, uncovered_px
 from jawusd.tracking.contour.scan import ARCH_NAMES, teeth_centre
 from jawusd.tracking.contour.solver import ContourSolver
-from jawusd.tracking.initialization.first_frame import first_record
+from jawusd.tracking.initialization.bootstrap import SIZE_HINT
+from jawusd.tracking.initialization.first_frame import CLEAR_FIT, EXPLAINS, first_record
 from jawusd.tracking.initialization.footage import Footage
 from jawusd.tracking.initialization.start_search import StartSearch
 
 # Maximum ratio of the uncovered mask fractions after and before correcting a swap for the swap to be reported [-].
 _PROOF = 0.5
-# Minimum uncovered fraction of a camera's masks for a swap to be suspected: good poses leave 0.01, and swapped masks of
-# similar cameras as little as 0.1.
-_ODD_SHARE = 0.05
+_ODD_SHARE = 0.05  # uncovered fraction of masks above which a swap is suspected: good poses leave 0.01, swaps 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,23 +50,15 @@ def possible_exchanges(sources: Sequence[CameraSource]) -> list[MaskExchange]:
     """Return every swap of arches in one camera or in all, and of masks between two cameras."""
     out = []
     for k, source in enumerate(sources):
-        out.append(
-            MaskExchange(
-                f"the masks of the upper and lower teeth are exchanged in camera {source.name}",
-                f"Exchange masks.upper and masks.lower of camera {source.name}.",
-                _with_masks(sources, {k: _masks(source).exchanged}),
-            )
-        )
+        message = f"the masks of the upper and lower teeth are exchanged in camera {source.name}"
+        hint = f"Exchange masks.upper and masks.lower of camera {source.name}."
+        out.append(MaskExchange(message, hint, _with_masks(sources, {k: _masks(source).exchanged})))
     out.append(all_arches_exchanged(sources))
     for a, b in combinations(range(len(sources)), 2):
-        first, second = sources[a].name, sources[b].name
-        out.append(
-            MaskExchange(
-                f"the masks of cameras {first} and {second} are exchanged",
-                f"Exchange the masks of cameras {first} and {second}, or their entries in the calibration.",
-                _with_masks(sources, {a: _masks(sources[b]), b: _masks(sources[a])}),
-            )
-        )
+        both = f"cameras {sources[a].name} and {sources[b].name}"
+        hint = f"Exchange the masks of {both}, or their entries in the calibration."
+        swapped = _with_masks(sources, {a: _masks(sources[b]), b: _masks(sources[a])})
+        out.append(MaskExchange(f"the masks of {both} are exchanged", hint, swapped))
     return out
 
 
@@ -120,25 +111,17 @@ def _with_masks(sources: Sequence[CameraSource], masks: dict[int, Masks]) -> tup
 
 def _sizes_differ(footage: Footage, sources: Sequence[CameraSource]) -> bool:
     """Return whether masks would be assigned to a camera with another image size."""
-    size = {_masks(source).upper: footage.cameras[source.name].size_px for source in footage.files}
-    size |= {_masks(source).lower: footage.cameras[source.name].size_px for source in footage.files}
-    return any(size[_masks(source).upper] != footage.cameras[source.name].size_px for source in sources)
+    sizes = {source.name: footage.cameras[source.name].size_px for source in footage.files}
+    size = {file: sizes[s.name] for s in footage.files for file in (_masks(s).upper, _masks(s).lower)}
+    return any(size[_masks(source).upper] != sizes[source.name] for source in sources)
 
 
-#: Minimum fit that counts as clear [-]: correct poses exceed it unless lips are nearly closed; wrong poses stay below
-#: 0.1 in one arch.
-CLEAR_FIT = 0.3
-#: Minimum acceptable fit with a mistake corrected [-]: wrong poses do not reach it.
-EXPLAINS = 0.1
 _MOST_CAMERAS = 4  # maximum number of cameras for which swaps are tried, since each swap costs a search
-#: Maximum number of images searched, separately for the start and for mistakes; each takes 2 to 3 s of CPU time. The
-#: limit covers all mistakes of four cameras, and those of eight except swaps. Work is counted instead of time, so that
-#: messages do not depend on the machine.
+#: Maximum number of images searched, separately for the start and for mistakes; each takes 2 to 3 s of CPU time. Work
+#: is counted instead of time, so that messages do not depend on the machine.
 MOST_PICTURES = 120
 # Scan sizes that are tried, relative to the given size [-]; each is close enough for teeth up to 5 % larger or smaller.
 _SIZES = (0.95, 1.05, 0.86, 1.16, 0.77, 1.28)
-#: Hint for scans of a wrong size; if the size is suspected, sizes are tried first.
-SIZE_HINT = "Check the scans' unit and scaling, and the square size of the calibration board."
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,8 +137,7 @@ class _Cause:
 def aligned(search: StartSearch, footage: Footage, poses: Array, frame: int) -> Array:
     """Return the poses aligned by the solver, if they pass the checks of a first frame, shape (2, 4, 4).
 
-    Raises:
-        TrackingError: the poses do not pass the checks.
+    Raises TrackingError if they do not pass the checks.
     """
     solver = search.solver
     with footage.views(teeth_centre(solver.scans, poses), solver.config.working_px_per_mm) as masks:
@@ -173,13 +155,11 @@ def raise_cause(
     """Raise an error for a mistake if correcting it makes the search succeed on one of the given frames.
 
     Suspected swaps are tried before others, and suspected sizes before everything else. Mistakes of single cameras, and
-    sizes that are not suspected, come last, since many poses fit once contradictions are excluded. At most
-    `MOST_PICTURES` images are searched; in a group of mistakes of which some were not tried, only a clear fit counts.
-    Next, a scan that fits none of its masks is reported; then other frames are tried within the same budget, since the
-    search can miss the teeth on a frame.
+    sizes that are not suspected, come last, since many poses fit once contradictions are excluded. In a group of
+    mistakes of which some were not tried, only a clear fit counts. Next, a scan that fits none of its masks is
+    reported; then other frames are tried within the same budget, since the search can miss the teeth on a frame.
 
     Args:
-        search, footage: the search that failed, and its footage.
         frames: frames to try, in this order.
         fits: `arch_fit` of both arches by frame, as found by the search [-], shape (2,).
         suspected: hints of the suspected mistakes; a mistake is identified by its hint.
@@ -193,7 +173,9 @@ def raise_cause(
     """
     exchanges = sorted(_exchanges(search, footage), key=lambda cause: cause.hint not in suspected)
     sizes = [*_sizes(search, footage)]
-    hands, cameras = [*_mirrored(search, footage)], [*_cameras(search, footage)]
+    message = "the scans are mirrored: left and right are exchanged"
+    hint = "Export them again without mirroring; one axis may have been negated."
+    hands, cameras = [_Cause(message, hint, search.mirrored(), footage)], [*_cameras(search, footage)]
     groups = (sizes, hands, exchanges, cameras) if SIZE_HINT in suspected else (hands, exchanges, sizes, cameras)
     count = sum(map(len, groups))
     pictures = sum(len(cause.footage.sources) for group in groups for cause in group)
@@ -229,13 +211,9 @@ def _raise_cause_on(frame: int, groups: Sequence[Sequence[_Cause]], only_clear: 
 
 
 def raise_for_unmatched_arch(fits: Mapping[int, Array]) -> None:
-    """Raise an error for a scan that fits none of its masks while the other scan clearly fits its own.
+    """Raise a TrackingError for a scan that fits none of its masks while the other scan clearly fits its own.
 
-    Args:
-        fits: `arch_fit` of both arches by frame, as found by a failed search [-], shape (2,).
-
-    Raises:
-        TrackingError: there is such a scan; the message names it.
+    `fits` is `arch_fit` of both arches by frame, as found by a failed search [-], shape (2,).
     """
     clear = {frame: fit for frame, fit in fits.items() if fit.max() >= CLEAR_FIT}
     arches = {int(fit.argmax()) for fit in clear.values()}
@@ -264,15 +242,6 @@ def _fit(cause: _Cause, frame: int) -> float:
     except (TrackingError, CaptureError):
         return 0.0
     return found.fit
-
-
-def _mirrored(search: StartSearch, footage: Footage) -> Iterator[_Cause]:
-    yield _Cause(
-        "the scans are mirrored: left and right are exchanged",
-        "Export them again without mirroring; one axis may have been negated.",
-        search.mirrored(),
-        footage,
-    )
 
 
 def _exchanges(search: StartSearch, footage: Footage) -> Iterator[_Cause]:

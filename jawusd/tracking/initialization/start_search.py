@@ -18,7 +18,7 @@ from jawusd.tracking.contour.scan import ARCH_NAMES, ARCHES, prepare_scan, teeth
 from jawusd.tracking.contour.solver import ContourSolver
 from jawusd.tracking.contour.views import View
 from jawusd.tracking.initialization.footage import Footage
-from jawusd.tracking.initialization.pose_search import Candidate, Grid, coarse_scan, hinge_at_front, search_arch
+from jawusd.tracking.initialization.pose_search import Grid, coarse_scan, distinct, hinge_at_front, search_arch
 
 # resolution of the search: a pixel is a third of the motion of the canines between neighbouring orientations
 _PX_PER_MM = 2.0
@@ -77,14 +77,7 @@ class StartSearch:
         T_anatomical_scan: Array,
         map_: Mapper = map,
     ) -> None:
-        """Prepare coarse scans.
-
-        Args:
-            meshes: upper and lower teeth scans in one coordinate frame, in occlusion [mm].
-            solver: solver with the same scans.
-            T_anatomical_scan: scan frame to (left, up, front) axes, shape (4, 4).
-            map_: distributes the search among threads.
-        """
+        """Prepare coarse scans; `T_anatomical_scan` (4, 4) maps the scan frame to (left, up, front) axes."""
         self.solver, self._map = solver.exact(), map_
         self._config = self.solver.config
         self._meshes, self._T_anatomical_scan = meshes, T_anatomical_scan
@@ -95,8 +88,12 @@ class StartSearch:
 
     def mirrored(self) -> StartSearch:
         """Return a search with mirrored scans, left and right exchanged."""
-        meshes = [mirrored_scan(mesh, self._T_anatomical_scan) for mesh in self._meshes]
-        return self._of(meshes, self._T_anatomical_scan)
+        T, meshes = self._T_anatomical_scan, []
+        for mesh in self._meshes:
+            points = transform_points(T, mesh.vertices) * [-1.0, 1.0, 1.0]
+            faces = np.ascontiguousarray(mesh.faces[:, ::-1])
+            meshes.append(replace(mesh, vertices=transform_points(se3_inverse(T), points), faces=faces))
+        return self._of(meshes, T)
 
     def scaled(self, factor: float) -> StartSearch:
         """Return a search with all lengths of the scans multiplied by a factor [-]."""
@@ -143,7 +140,7 @@ class StartSearch:
     def _searched(self, r: int, views: Sequence[View], base: Array, grid: Grid) -> list[Array]:
         """Return the best poses of an arch that are distinct from one another."""
         found = search_arch(self._coarse[r], r, views, _PX_PER_MM, base, self._hinges[r], grid, self._map)
-        return self._distinct(found, r)
+        return [candidate.pose for candidate in distinct(found, self._coarse[r].probes, _DISTINCT_MM, _FINALISTS)]
 
     def _settled(
         self, finalists: Sequence[Sequence[Array]], views: Sequence[View], footage: Footage, frame: int
@@ -159,18 +156,6 @@ class StartSearch:
         best = int(np.argmax(objective))
         fits = arch_fit(self.solver.scans, ends[best], views, self._config.uncovered_price)
         return SearchResult(ends[best].poses, float(objective[best]), fits)
-
-    def _distinct(self, found: Sequence[Candidate], r: int) -> list[Array]:
-        """Return the best poses that are distinct from one another."""
-        probes = self._coarse[r].probes
-        kept: list[Array] = []
-        for candidate in found:
-            here = transform_points(candidate.pose, probes)
-            if all(np.linalg.norm(here - transform_points(k, probes), axis=1).mean() > _DISTINCT_MM for k in kept):
-                kept.append(candidate.pose)
-                if len(kept) == _FINALISTS:
-                    break
-        return kept
 
     def _refined_pairs(self, finalists: Sequence[Sequence[Array]], views: Sequence[View]) -> list[Array]:
         """Refine the finalists coarsely; return up to four anatomically possible pairs, shape (2, 4, 4) each."""
@@ -209,12 +194,7 @@ class StartSearch:
 
 
 def _opened(crowns: Array, T_anatomical_scan: Array) -> list[Array]:
-    """Return T_upper_lower of a closed and of opened jaws, shape (4, 4) each.
-
-    Args:
-        crowns: crown vertices of the lower teeth, scan coordinates [mm], shape (N, 3).
-        T_anatomical_scan: scan frame to (left, up, front) axes, shape (4, 4).
-    """
+    """Return T_upper_lower (4, 4) of a closed and of opened jaws; `crowns` (N, 3) are those of the lower teeth."""
     points = transform_points(T_anatomical_scan, crowns)
     up, front = _CONDYLES_MM
     hinge = points[points[:, 2].argmax()] * [0.0, 1.0, 1.0] + [0.0, up, front]
@@ -227,11 +207,9 @@ def _opened(crowns: Array, T_anatomical_scan: Array) -> list[Array]:
 
 
 def guessed_axes(places: Array, eyes: Array) -> Array:
-    """Return a guess of the left, up and front axes of the teeth in the world, shape (3, 3), axes in columns.
+    """Return a guess of the left, up and front axes of the teeth in the world, as columns, shape (3, 3).
 
-    Args:
-        places: centres of the upper and the lower masks in world coordinates [mm], shape (2, 3).
-        eyes: camera centres [mm], shape (C, 3).
+    `places` (2, 3) are the centres of the upper and the lower masks, `eyes` (C, 3) those of the cameras [mm].
     """
     rays = eyes - places.mean(0)
     front = (rays / np.linalg.norm(rays, axis=1, keepdims=True)).mean(0)
@@ -240,10 +218,3 @@ def guessed_axes(places: Array, eyes: Array) -> Array:
     up -= front * (front @ up)
     up /= np.linalg.norm(up)
     return np.stack([np.cross(up, front), up, front], axis=1)
-
-
-def mirrored_scan(mesh: Mesh, T_anatomical_scan: Array) -> Mesh:
-    """Return a teeth scan with left and right exchanged, in the same coordinate frame."""
-    points = transform_points(T_anatomical_scan, mesh.vertices) * [-1.0, 1.0, 1.0]
-    vertices = transform_points(se3_inverse(T_anatomical_scan), points)
-    return replace(mesh, vertices=vertices, faces=np.ascontiguousarray(mesh.faces[:, ::-1]))

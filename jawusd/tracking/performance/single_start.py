@@ -24,12 +24,14 @@ from jawusd.tracking.contour.quality import arch_fit
 from jawusd.tracking.contour.scan import ARCH_NAMES, ARCHES
 from jawusd.tracking.contour.solver import ContourSolver
 from jawusd.tracking.contour.views import View
+from jawusd.tracking.initialization.first_frame import CLEAR_FIT
 from jawusd.tracking.initialization.footage import Footage
 from jawusd.tracking.initialization.pose_search import (
     Candidate,
     Grid,
     ShiftCorrelation,
     coarse_scan,
+    distinct,
     hinge_at_front,
     search_arch,
 )
@@ -63,9 +65,7 @@ _HEADS, _JAWS, _TRIED, _FINALISTS, _WINNERS = 17, 32, 12, 24, 5
 # Penalty per crown pixel outside the mask, in px of contour [1/px]: low, since lips may hide crowns.
 _OUTSIDE_PRICE = 0.05
 _DISTINCT_MM = 3.0  # minimum distance between head poses that are kept [mm], as mean displacement of the teeth
-# Fit of the worse arch above which a start is accepted at once, and fit below which it is rejected [-]; the limit for
-# several cameras is `start_causes.CLEAR_FIT`.
-_CLEAR_FIT, _LEAST_FIT = 0.3, 0.1
+_LEAST_FIT = 0.1  # fit of the worse arch below which a start is rejected [-]; it is accepted at once from CLEAR_FIT on
 _NEARBY = LARGEST_SIGMA / 3.0  # standard deviations of the true pose about a candidate pose [rad, mm, mm]
 
 
@@ -111,7 +111,7 @@ class SingleStart:
             found = self.at(footage, frame)
             if found is not None and (best is None or found.fit > best.fit):
                 best = found
-            if best is not None and best.fit >= (_CLEAR_FIT if tried < _FRAMES_TRIED else _LEAST_FIT):
+            if best is not None and best.fit >= (CLEAR_FIT if tried < _FRAMES_TRIED else _LEAST_FIT):
                 break
         if best is None or best.fit < _LEAST_FIT:
             raise TrackingError(
@@ -161,27 +161,13 @@ class SingleStart:
             found = [
                 replace(head, objective=head.objective - self._outside_price(0, head.pose, views[0])) for head in found
             ]
-            heads = self._distinct(sorted(found, key=lambda head: -head.objective))
+            found = sorted(found, key=lambda head: -head.objective)
+            heads = distinct(found, self._coarse[0].probes[::20], _DISTINCT_MM, _HEADS)
             pairs = sorted(
                 (pair for some in self._map(partial(self._with_jaws, views), heads) for pair in some), key=_descending
             )
             tried += [(self._after(pose, instant, few)[0], pose) for _, pose in pairs[:_TRIED]]
         return [pose for _, pose in sorted(tried, key=_descending)[:_FINALISTS]]
-
-    def _distinct(self, found: Sequence[Candidate]) -> list[Candidate]:
-        """Return the best candidates that are mutually distinct."""
-        probes = self._coarse[0].probes[::20]
-        kept: list[Candidate] = []
-        places = np.empty((_HEADS, len(probes), 3))
-        for head in found:
-            here = transform_points(head.pose, probes)
-            apart = np.linalg.norm(places[: len(kept)] - here, axis=-1).mean(1)
-            if not (apart < _DISTINCT_MM).any():
-                places[len(kept)] = here
-                kept.append(head)
-                if len(kept) == _HEADS:
-                    break
-        return kept
 
     def _with_jaws(self, views: Sequence[View], head: Candidate) -> list[tuple[float, Pose]]:
         """Return the two most promising jaw poses for a head pose, with the objectives of both arches together."""

@@ -10,9 +10,9 @@ import numpy as np
 from jawusd.base.arrays import Array
 from jawusd.base.errors import TrackingError
 from jawusd.tracking.contour.frame_record import FrameRecord
+from jawusd.tracking.initialization.first_frame import CLEAR_FIT
 from jawusd.tracking.initialization.footage import Footage, MaskSurvey
 from jawusd.tracking.initialization.start import SURVEYED
-from jawusd.tracking.initialization.start_causes import CLEAR_FIT
 from jawusd.tracking.initialization.start_search import SearchResult, StartSearch
 
 _TRIED = 3  # maximum number of frames of a lost stretch in which the teeth are searched for
