@@ -145,7 +145,7 @@ def test_one_mask_does_not_outvote_two(tracker):
 )
 def test_every_check_reports_its_value_and_limit(tracker, reason, limits, words):
     strict = FrameTracker(ContourSolver(SCANS, CONFIG), replace(CONFIG, **limits), tracker.history)
-    record = strict.align_once(POSES[1], _views(1), 0.0)
+    record = strict.track([POSES[1]], _views(1), None)
     assert record.status.tolist() == [LOST, LOST] and {loss.reason for loss in record.losses} == {reason}
     for loss in record.losses:
         assert re.search(words, loss.reason.explain(loss.value, loss.limit))
@@ -155,7 +155,7 @@ def test_one_mask_is_too_few_for_an_arch(tracker):
     views = _views(1)
     for view in views[1:]:
         view.present[1] = False
-    record = tracker.align_once(POSES[1], views, 0.0)
+    record = tracker.track([POSES[1]], views, None)
     assert record.status.tolist() == [TRACKED, LOST]
     assert record.losses[1] == (LostReason.FEW_MASKS, 1, 2) and record.losses[0].reason == LostReason.NONE
     assert str(LostReason.FEW_MASKS) == "few masks" and str(LOST) == "lost"

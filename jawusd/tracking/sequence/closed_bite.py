@@ -34,20 +34,13 @@ _LONGEST_REST = 24  # maximum number of rest frames used on either side; more wo
 
 @dataclass(frozen=True, eq=False)
 class RestFrames:
-    """Frames with closed teeth, and whether they are used to correct the position of the lower scan.
+    """Frames with closed teeth, and whether they are used to correct the position of the lower scan."""
 
-    Attributes:
-        frames: frame numbers.
-        named: whether the capture specifies one of the frames.
-        point, lower: centre of the teeth, and of the lower crowns, in scan coordinates [mm], shape (3,).
-        apply: whether to correct the position of the lower scan.
-    """
-
-    frames: tuple[int, ...]
-    named: bool
-    point: Array
-    lower: Array
-    apply: bool
+    frames: tuple[int, ...]  # frame numbers
+    named: bool  # whether the capture specifies one of the frames
+    point: Array  # centre of the teeth in scan coordinates [mm], shape (3,)
+    lower: Array  # centre of the lower crowns in scan coordinates [mm], shape (3,)
+    apply: bool  # whether to correct the position of the lower scan
 
 
 def rest_frames(
@@ -56,10 +49,9 @@ def rest_frames(
     """Return the frames in which the teeth rest together, around a named frame or the frame with the smallest opening.
 
     Args:
-        named: frame named in the capture; if None, the frame with the smallest jaw opening is searched for.
+        named: frame named in the capture, or None.
         up: unit vector from the lower to the upper teeth in scan axes, shape (3,).
-        point, probes: centre of the teeth (3,), and points spread over the lower teeth (N, 3), in scan coordinates
-            [mm].
+        point, probes: centre of the teeth (3,), and points of the lower teeth (N, 3), in scan coordinates [mm].
     """
     relative = {frame: relative_pose(*records[frame].solution.poses) for frame in whole_frames(records)}
     if named is None:
@@ -91,14 +83,10 @@ def _moved_mm(one: Array, other: Array, probes: Array) -> float:
     return float(np.linalg.norm(gap, axis=1).mean())
 
 
-# Scale of the Student distribution of the registration error [mm], which includes the effect of bite force; and lever
-# arm that converts this scale to a rotation [mm].
-_BITE_MM = 0.03
-_ARCH_MM = 25.0
-# degrees of freedom of the Student distribution: about 1 % of registrations are off by ten times the scale
-_DEGREES_OF_FREEDOM = 4.0
-#: Fraction of the outline error variance that is constant over a take, in addition to annotator bias [-]: if it were
-#: larger, noise in a few frames with closed teeth would shift the whole take.
+_BITE_MM = 0.03  # scale of the Student distribution of the registration error [mm], including the effect of bite force
+_ARCH_MM = 25.0  # lever arm that converts this scale to a rotation [mm]
+_DEGREES_OF_FREEDOM = 4.0  # of this distribution: about 1 % of registrations are off by ten times the scale
+#: Fraction of the outline error variance that is constant over a take, in addition to annotator bias [-].
 STEADY = 0.3
 _FEWEST_FRAMES = 2
 # Effective number of independent measurements per frame with closed teeth, and maximum for all such frames:
@@ -109,24 +97,16 @@ _USUAL_FRAMES = 2000  # number of evenly spaced frames from which the median cov
 
 @dataclass(frozen=True, eq=False)
 class ClosedBite:
-    """Errors measured in frames with the teeth closed; twists are (omega [rad], v [mm]) about `point` in scan axes.
-
-    Attributes:
-        frames: the frames used.
-        point: centre of the teeth, scan coordinates [mm], shape (3,).
-        registration: left twist that corrects the lower scan, shape (6,), and its covariance (6, 6).
-        steady: constant errors of the poses of both arches as right twists, shape (2, 6).
-        spread, remaining: covariances before and after the correction of the constant errors of upper arch, lower arch,
-            and lower arch relative to upper, shape (3, 6, 6).
-    """
+    """Errors measured in frames with the teeth closed; twists are (omega [rad], v [mm]) about `point` in scan axes."""
 
     frames: tuple[int, ...]
-    point: Array
-    registration: Array
-    registration_covariance: Array
-    steady: Array
+    point: Array  # centre of the teeth, scan coordinates [mm], shape (3,)
+    registration: Array  # left twist that corrects the lower scan, shape (6,)
+    registration_covariance: Array  # shape (6, 6)
+    steady: Array  # constant errors of the poses of both arches as right twists, shape (2, 6)
+    #: covariances of the constant errors of upper arch, lower arch, and lower arch relative to upper, shape (3, 6, 6)
     spread: Array
-    remaining: Array
+    remaining: Array  # the same after the correction
 
     def correct(self, poses: Array, registered: bool) -> Array:
         """Return poses (F, 2, 4, 4) without constant errors; if `registered`, for the lower scan moved by `motion`."""
@@ -165,10 +145,10 @@ class ClosedBite:
         """Return the covariances of left twists about the world origin after the correction, shape (F, 6, 6).
 
         Args:
-            covariance, steady: total covariance before the correction, and the part of it that is constant over the
-                take, shapes (F, 6, 6).
+            covariance, steady: total covariance before the correction, and the part of it that is constant, shapes (F,
+                6, 6).
             T_world_scan: poses in whose axes the error is constant, shape (F, 4, 4).
-            which: 0 upper arch, 1 lower arch, 2 lower arch relative to upper arch (for which `T_world_scan` is the
+            which: 0 upper arch, 1 lower arch, 2 lower arch relative to upper arch (`T_world_scan` is then the
                 identity).
         """
         A = se3_adjoint(translation(-self.point) @ se3_inverse(T_world_scan))
@@ -184,16 +164,6 @@ class ClosedBite:
         return out
 
 
-def steady_part(outline: Array, habits: Array) -> Array:
-    """Return the part of pose covariances (of any shape) that is constant over a take.
-
-    Args:
-        outline: covariance due to the outline errors of single frames.
-        habits: covariance due to annotator bias, of the same shape.
-    """
-    return np.asarray(STEADY * outline + habits, np.float64)
-
-
 def closed_bite(
     frames: NDArray[np.int64], poses: Array, outline: Array, habits: Array, rest: RestFrames
 ) -> ClosedBite | None:
@@ -202,8 +172,8 @@ def closed_bite(
     Args:
         frames: frame numbers, shape (F,).
         poses: T_world_upper, T_world_lower, shape (F, 2, 4, 4), NaN where lost.
-        outline, habits: parts of the covariances of the poses' left twists, as in `steady_part`, shapes (F, 2, 6, 6).
-        rest: frames with closed teeth.
+        outline, habits: covariances of the poses' left twists by outline errors of frames and by annotator bias, (F, 2,
+            6, 6).
     """
     point = rest.point
     known = np.asarray(np.isfinite(poses).all((1, 2, 3)) & np.isfinite(outline).all((1, 2, 3)), bool)
@@ -220,7 +190,7 @@ def closed_bite(
         return np.asarray(A @ covariance @ np.swapaxes(A, -1, -2), np.float64)
 
     usual = np.flatnonzero(known)[:: max(1, int(known.sum()) // _USUAL_FRAMES)]
-    steady = local(steady_part(outline[usual], habits[usual]), poses[usual])
+    steady = local(STEADY * outline[usual] + habits[usual], poses[usual])
     upper, lower = (_positive(part) for part in np.median(steady, axis=0))
     independent = min(1.0 + _NEW_PER_FRAME * (count - 1), _MOST_FRAMES)
     noise = (1.0 - STEADY) / independent * local(outline[used], poses[used]).mean(0).sum(0)
@@ -262,9 +232,9 @@ def registration_findings(found: Registration) -> list[Finding]:
 
 def registration_unknown(rest: RestFrames) -> Finding:
     """Return a note that the take cannot verify the registration of the scans."""
-    where = (
-        "the frame named in rest_frame is not tracked" if rest.named else "no frame shows the teeth at rest together"
-    )
+    where = "no frame shows the teeth at rest together"
+    if rest.named:
+        where = "the frame named in rest_frame is not tracked"
     hint = "Record closed teeth with both arches in view, and name such a frame as rest_frame in [motion]."
     return Finding("registration_unknown", "note", f"{where}: the bite of the scans was not checked", hint=hint)
 
@@ -274,11 +244,7 @@ _MOST_MM, _MOST_DEG = 3.0, 8.0
 
 
 def check_registration(found: Registration) -> None:
-    """Reject a registration correction that is too large.
-
-    Raises:
-        TrackingError: the lower scan is too far off its position in the closed bite of the take.
-    """
+    """Raise a TrackingError if the registration correction of the lower scan is too large."""
     shift, turn, *_ = registration_sizes(found)
     if found["applied"] and (shift > _MOST_MM or turn > _MOST_DEG):
         raise TrackingError(
@@ -298,7 +264,7 @@ def observe_bite(
 ) -> None:
     """Add the observation that the teeth are closed to a take; outline biases that separate the teeth become unlikely.
 
-    `variance_px3` is the outline variance times correlation length per arch [px^3], shape (2,).
+    `variance_px3` is as for `TakeEquations`.
     """
     used = [f for f in rest.frames if f in records and records[f].found.all()]
     if len(used) < _FEWEST_FRAMES:

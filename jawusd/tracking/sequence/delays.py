@@ -28,9 +28,9 @@ def delay_motions(records: Mapping[int, FrameRecord], frame: int, delays: Array)
 def _motion_twists(records: Mapping[int, FrameRecord], frame: int, arch: int) -> tuple[Array, Array] | None:
     """Fit a parabola in time; return the twist per frame about the arch's centre and its change per frame, shapes (6,).
 
-    The parabola passes through both neighbouring frames, or through two frames on one side if the other side is not
-    tracked. More frames would smooth too much, since a jaw starts and stops within one or two frames. Across a gap,
-    uniform motion is assumed. Without tracked frames nearby, the result is None.
+    It passes through both neighbouring frames, or through two frames on one side: more frames would smooth too much,
+    since a jaw starts and stops within one or two frames. Across a gap, uniform motion is assumed; None if it is too
+    wide.
     """
 
     def step(frames: int) -> Array:
@@ -54,7 +54,11 @@ def interpolation_errors(records: Mapping[int, FrameRecord], frame: int, arch: i
 
     The error is the next term of Newton's interpolation, from the third difference of four consecutive frames.
     """
-    first = next((f for f in (frame - 1, frame - 2, frame, frame - 3) if _all_tracked(records, f, arch)), None)
+
+    def tracked(first: int) -> bool:
+        return all(_is_tracked(records, first + k, arch) for k in range(4))
+
+    first = next((f for f in (frame - 1, frame - 2, frame, frame - 3) if tracked(f)), None)
     if first is None:
         return np.zeros((len(delays), 6))
     centre = records[frame].solution.centres[arch]
@@ -65,10 +69,6 @@ def interpolation_errors(records: Mapping[int, FrameRecord], frame: int, arch: i
     nodes = np.array([0, 1, 2] if offset < 2 else [1, 2, 3])  # time offsets of the parabola's nodes [frames]
     share = np.prod(delays[:, None] + (offset - nodes), axis=1) / 6.0
     return np.asarray(share[:, None] * third, np.float64)
-
-
-def _all_tracked(records: Mapping[int, FrameRecord], first: int, arch: int) -> bool:
-    return all(_is_tracked(records, first + k, arch) for k in range(4))
 
 
 def velocity_twist(records: Mapping[int, FrameRecord], frame: int, arch: int) -> Array | None:
@@ -90,7 +90,7 @@ BRIDGE_FRAMES = 6
 def bridge(records: Mapping[int, FrameRecord], frame: int, arch: int) -> tuple[Array, Array] | None:
     """Interpolate an arch linearly between tracked frames; return its pose (4, 4) and twist per frame about its centre.
 
-    The twist has shape (6,). Return None without tracked frames nearby on both sides.
+    Return None without tracked frames nearby on both sides.
     """
     reach = range(1, BRIDGE_FRAMES + 1)
     before = next((frame - k for k in reach if _is_tracked(records, frame - k, arch)), None)

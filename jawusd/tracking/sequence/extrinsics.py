@@ -18,9 +18,8 @@ from jawusd.tracking.contour.views import View
 class Extrinsics:
     """Corrections of camera poses.
 
-    For camera c, the world is moved by exp(twists[c]) about the pivot; T_cam_world is multiplied by this motion from
-    the right. A motion common to all cameras would be a motion of the world, so the sum of the twists is constrained to
-    zero.
+    For camera c, the world is moved by exp(twists[c]) about the pivot. A motion common to all cameras would be a motion
+    of the world, so the sum of the twists is constrained to zero.
     """
 
     T_cam_world: Array  # the calibrated poses, shape (C, 4, 4)
@@ -58,8 +57,7 @@ class Extrinsics:
     def precision(self, turn_rad: float, move_mm: float) -> Array:
         """Return the prior precision of the twists of each camera, shape (C, 6, 6).
 
-        The priors apply to rotations about the camera centre and to translations, with the configured standard
-        deviations per axis.
+        The standard deviations per axis apply to rotations about the camera centre and to translations.
         """
         A = se3_adjoint(translation(-self.pivot) @ se3_inverse(self.T_cam_world))
         variance = np.r_[np.full(3, turn_rad**2), np.full(3, move_mm**2)]
@@ -82,11 +80,6 @@ class Extrinsics:
         }
 
 
-def twist_transfer(pivot: Array, centre: Array) -> Array:
-    """Return the matrix that converts a twist about a pivot to one about a centre, shape (6, 6)."""
-    return se3_adjoint(translation(pivot - centre))
-
-
 def corrected_cameras(cameras: Sequence[Camera], meta: TracksMeta) -> list[Camera]:
     """Return cameras with the corrections of pose and focal length that are stored in the metadata of tracks."""
     poses = meta["extrinsics"]["T_cam_world"] if "extrinsics" in meta else {}
@@ -98,8 +91,7 @@ def corrected_cameras(cameras: Sequence[Camera], meta: TracksMeta) -> list[Camer
 def _with_focal(camera: Camera, factor: float) -> Camera:
     """Return a camera with its focal length multiplied by a factor f; the distortion of each pixel is kept.
 
-    Normalised coordinates x become x / f; in OpenCV's distortion model, k1 therefore becomes f^2 k1, and p1 becomes f
-    p1.
+    Normalised coordinates x become x / f; in OpenCV's model, k1 therefore becomes f^2 k1, and p1 becomes f p1.
     """
     K = camera.K.copy()
     K[:2, :2] *= factor

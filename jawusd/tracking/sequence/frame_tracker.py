@@ -99,11 +99,6 @@ class FrameTracker:
             trial = self._try(trial.solution.poses, views, gates, kept)
         return self._record(first, trial)
 
-    def align_once(self, start: Array, views: Sequence[View], reach_px: float) -> FrameRecord:
-        """Align a frame from one pair of predicted poses (2, 4, 4), without further attempts; see `track`."""
-        trial = self._begin(start, views, self._config.gates_from(reach_px))
-        return self._record(trial, trial)
-
     def _begin(self, start: Array, views: Sequence[View], gates: Sequence[float]) -> _Trial:
         """Align once and, if some masks are wrong, again without them."""
         use = present_masks(views)

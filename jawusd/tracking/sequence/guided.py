@@ -26,9 +26,8 @@ from jawusd.tracking.initialization.first_frame import FIRST_ROUNDS, first_recor
 from jawusd.tracking.sequence.frame_tracker import FrameTracker
 from jawusd.tracking.sequence.history import History
 
-#: Function that returns the views of a frame. Arguments: the frame number of the reference camera, expected
-#: T_world_upper and T_world_lower, shape (2, 4, 4), and the index of the round, which is 0 for poses not yet aligned
-#: with masks.
+#: Returns the views of a frame, given its number in the reference camera, expected T_world_upper and T_world_lower,
+#: shape (2, 4, 4), and the index of the round, which is 0 for poses not yet aligned with masks.
 MakeViews = Callable[[int, Array, int], Sequence[View]]
 
 
@@ -44,12 +43,10 @@ class GuidedTracker:
         config: TrackingConfig | None = None,
         executor: Executor | None = None,
     ) -> None:
-        """Prepare the scans.
+        """Prepare the scans, which are in one coordinate frame, in occlusion [mm].
 
         Args:
-            upper, lower: teeth scans in one coordinate frame, in occlusion [mm].
-            see: function that generates the masks of a frame; masks generated around a wrong pose tend to confirm that
-                pose.
+            see: generates the masks of a frame; masks generated around a wrong pose tend to confirm that pose.
             rounds: number of times that the masks and then the poses of a frame are updated.
 
         Raises:
@@ -69,8 +66,7 @@ class GuidedTracker:
     def picked(self, bootstrap: Bootstrap | None, cameras: Mapping[str, Camera]) -> Array:
         """Return T_world_upper and T_world_lower from the picks, shape (2, 4, 4).
 
-        Raises:
-            TrackingError: no picks, too few, or picks that contradict one another.
+        Raises TrackingError if there are no picks, too few, or picks that contradict one another.
         """
         if bootstrap is None:
             raise TrackingError(
@@ -84,11 +80,7 @@ class GuidedTracker:
         )
 
     def begin(self, frame: int, poses: Array) -> FrameRecord:
-        """Align the first frame from picked poses.
-
-        Raises:
-            TrackingError: the teeth do not fit the views.
-        """
+        """Align the first frame from picked poses; raises TrackingError if the teeth do not fit the views."""
         for turn in range(FIRST_ROUNDS):
             views = self._see(frame, poses, min(turn, self._rounds - 1))
             record = first_record(self._solver, self._config, poses, views, frame)
@@ -103,7 +95,7 @@ class GuidedTracker:
         Args:
             frames: frame numbers in either direction, starting next to a frame in `past`.
             guide: T_world_upper and T_world_lower, as found by colour, shape (2, 4, 4), by frame.
-            past: records of the frames tracked before, from the first aligned frame to the neighbour of `frames`.
+            past: summaries of the frames tracked before, from the first aligned frame to the neighbour of `frames`.
         """
         history = History(self._config.history_frames, self._config.score_frames)
         for before in past:

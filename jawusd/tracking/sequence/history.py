@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import deque
-from typing import NamedTuple
 
 import numpy as np
 
@@ -53,13 +52,11 @@ class MotionPredictor:
         return [moving, self._last.copy(), half]
 
     def update(self, poses: Array, found: Mask, seen: Mask, guessed: bool = False) -> None:
-        """Add the next frame; for arches not found, keep the predictions or the given guesses.
+        """Add the next frame; for arches not found, keep the predictions or, if `guessed`, the given poses.
 
         Args:
             poses: T_world_upper, T_world_lower, shape (2, 4, 4).
-            found: whether each arch has a reliable pose, shape (2,).
-            seen: whether each arch has any mask, shape (2,).
-            guessed: whether the given poses of arches not found are better guesses than the predictions.
+            found, seen: whether each arch has a reliable pose, and any mask, shape (2,).
         """
         expected = self.predict()
         for r in ARCHES:
@@ -111,12 +108,11 @@ class MotionPredictor:
 class SearchBudget:
     """A budget for failed multi-start searches in a take.
 
-    A search takes as long as tracking ten to fifty frames, and wrong masks would otherwise trigger a failing search in
-    every affected frame, in both directions. Work is counted instead of time, so results do not depend on the machine.
+    Wrong masks would otherwise trigger a failing search, as long as tracking ten to fifty frames, in every affected
+    frame. Work is counted instead of time, so results do not depend on the machine.
     """
 
     def __init__(self, frames: int) -> None:
-        """Set the search budget for a take of `frames` frames."""
         self.most = self._left = _FRUITLESS + frames // _FRAMES_PER_FRUITLESS
         self.fruitless = 0
         self._searched: set[int] = set()
@@ -140,22 +136,6 @@ class SearchBudget:
         self.fruitless += not found
 
 
-class _Partial(NamedTuple):
-    """Quality of frames in which a camera is missing; used if no frame has all cameras."""
-
-    scores: deque[Array]
-    residuals: deque[Array]
-    coverages: deque[Array]
-
-
-class _Usual(NamedTuple):
-    """Medians of recent frames; see the methods of `History`."""
-
-    score: Array
-    residual: Array
-    coverage: Array
-
-
 class History:
     """The quality of recent good frames, as a reference for the next frame.
 
@@ -164,11 +144,11 @@ class History:
 
     def __init__(self, length: int, score_length: int) -> None:
         """Start without frames; use at most `length` recent frames, and at most `score_length` frames for scores."""
-        self._scores: deque[Array] = deque(maxlen=score_length)
-        self._residuals: deque[Array] = deque(maxlen=length)
-        self._coverages: deque[Array] = deque(maxlen=length)
-        self._partial = _Partial(deque(maxlen=score_length), deque(maxlen=length), deque(maxlen=length))
-        self._usual: _Usual | None = None
+        lengths = (score_length, length, length)
+        # scores, residuals and coverage errors of frames with all cameras, and of frames in which a camera is missing
+        self._whole: list[deque[Array]] = [deque(maxlen=most) for most in lengths]
+        self._partial: list[deque[Array]] = [deque(maxlen=most) for most in lengths]
+        self._usual: list[Array] | None = None  # their medians, cached until the next frame is added
 
     def add(self, record: FrameRecord) -> None:
         """Add the record of a frame; only well-tracked arches count."""
@@ -177,36 +157,30 @@ class History:
     def add_summary(self, past: FrameSummary) -> None:
         """Add the summary of a frame."""
         self._usual = None
-        good = past.status == TRACKED
-        self._scores.append(np.where(good[:, None], past.score_px, np.nan))
-        self._residuals.append(np.where(good, past.residual_px, np.nan))
-        self._coverages.append(np.where(good[:, None] & past.used, past.coverage, np.nan))
-        partial = past.status == PARTIAL
-        used = partial[:, None] & past.used
-        self._partial.scores.append(np.where(used, past.score_px, np.nan))
-        self._partial.residuals.append(np.where(partial, past.residual_px, np.nan))
-        self._partial.coverages.append(np.where(used, past.coverage, np.nan))
+        good, partial = (past.status == status for status in (TRACKED, PARTIAL))
+        used, partly_used = good[:, None] & past.used, partial[:, None] & past.used
+        figures = (past.score_px, past.residual_px, past.coverage)
+        for kept, figure, valid in zip(self._whole, figures, (good[:, None], good, used), strict=True):
+            kept.append(np.where(valid, figure, np.nan))
+        for kept, figure, valid in zip(self._partial, figures, (partly_used, partial, partly_used), strict=True):
+            kept.append(np.where(valid, figure, np.nan))
 
     def usual_score(self) -> Array:
         """Return the median score per arch and view [px], shape (2, C); 0 while unknown."""
-        return self._medians().score
+        return self._medians()[0]
 
     def usual_residual(self) -> Array:
         """Return the median residual per arch [px], shape (2,); infinite while unknown."""
-        return self._medians().residual
+        return self._medians()[1]
 
     def usual_coverage(self) -> Array:
         """Return the median coverage error per arch and view, shape (2, C); 0 while unknown."""
-        return self._medians().coverage
+        return self._medians()[2]
 
-    def _medians(self) -> _Usual:
-        """Return the medians, cached until the next frame is added."""
+    def _medians(self) -> list[Array]:
         if self._usual is None:
-            self._usual = _Usual(
-                _median(self._scores, _median(self._partial.scores, 0.0)),
-                _median(self._residuals, _median(self._partial.residuals, np.inf)),
-                _median(self._coverages, _median(self._partial.coverages, 0.0)),
-            )
+            kept = zip(self._whole, self._partial, (0.0, np.inf, 0.0), strict=True)
+            self._usual = [_median(whole, _median(partial, unknown)) for whole, partial, unknown in kept]
         return self._usual
 
 

@@ -56,47 +56,41 @@ class KinematicPrior:
         """Return the twist (6,) from the nearest model pose to T_upper_lower (4, 4), and its precision P (6, 6)."""
         d = self.jaw.encode(relative)[0]
         pose = self.jaw.pose(d)
-        return se3_log(relative @ se3_inverse(pose)), self._precision(d, pose)
-
-    def _precision(self, d: Array, pose: Array) -> Array:
-        """Return the precision P of the deviation at a model pose, shape (6, 6)."""
         M = mandible_metric(transform_points(pose, self.jaw.landmarks))
         # The left Jacobian converts the derivative of the logarithm to that of the pose (Barfoot 2017, eq. 7.85).
         J = se3_left_jacobian(self.jaw.twist(d)) @ self.jaw.jacobian(d)
         along = M @ J
         normal = M - along @ np.linalg.solve(J.T @ along, along.T)
-        return _NORMAL_DIRECTIONS / self.spread_mm**2 * normal
+        return se3_log(relative @ se3_inverse(pose)), _NORMAL_DIRECTIONS / self.spread_mm**2 * normal
 
 
-_FEWEST = 15  # minimum number of poses for estimating their spread about the model
+def model_spread_mm(jaw: JawRig, relative: Array) -> float:
+    """Return the rms landmark distance of T_upper_lower (N, 4, 4) from a model [mm], including tracking noise."""
+    return float(np.sqrt(np.mean(jaw.encode(relative)[1] ** 2)))
+
+
+#: Minimum number of poses for estimating their spread about the model.
+FEWEST_POSES = 15
 _ROUNDS = 3  # number of linearisations: the model is nearly linear within the range of pose errors
 
 
 def weigh_with_model(tracks: Tracks, jaw: JawRig) -> Tracks:
-    """Return tracks whose final relative poses are the most likely ones given the raw poses and the model.
+    """Return tracks whose final relative poses are the most likely ones given the raw poses and a model fitted to them.
 
-    The function is intended for tracks from colours, whose errors extend over whole teeth: the model improves the
-    positions of molars and condyles, and hardly changes that of the incisal point. The result is the mean of the
-    product of two Gaussians, relinearised `_ROUNDS` times; the spread of the `KinematicPrior` is the rms distance of
-    raw poses from the model. Upper teeth, raw poses, covariances and sigmas remain as measured. The width of the prior
-    is stored in the metadata as `prior_spread_mm`.
-
-    Args:
-        tracks: tracks from colours, fitted without a model.
-        jaw: the jaw model fitted to the tracks.
+    It is intended for tracks from colours, whose errors extend over whole teeth. The result is the mean of the product
+    of two Gaussians, relinearised `_ROUNDS` times. Upper teeth, raw poses, covariances and sigmas remain as measured.
+    The width of the prior is stored in the metadata as `prior_spread_mm`.
     """
     known = np.isfinite(tracks.raw_T_upper_lower).all((1, 2)) & np.isfinite(tracks.T_upper_lower).all((1, 2))
     known &= np.isfinite(tracks.covariance_relative).all((1, 2))
-    if known.sum() < _FEWEST:
+    if known.sum() < FEWEST_POSES:
         return tracks
-    distance_mm = jaw.encode(tracks.raw_T_upper_lower[known])[1]
-    spread_mm = float(np.sqrt(np.mean(distance_mm**2)))
-    prior = KinematicPrior(jaw, spread_mm)
+    prior = KinematicPrior(jaw, model_spread_mm(jaw, tracks.raw_T_upper_lower[known]))
     relative, lower = tracks.T_upper_lower.copy(), tracks.T_world_lower.copy()
     for k in np.flatnonzero(known).tolist():
         relative[k] = _likeliest(relative[k], tracks.covariance_relative[k], prior)
         lower[k] = tracks.T_world_upper[k] @ relative[k]
-    meta: TracksMeta = {**tracks.meta, "prior_spread_mm": spread_mm}
+    meta: TracksMeta = {**tracks.meta, "prior_spread_mm": prior.spread_mm}
     return replace(tracks, T_upper_lower=relative, T_world_lower=lower, meta=meta)
 
 

@@ -22,13 +22,11 @@ class LostSearch:
     """Searches for both arches in the masks of frames in which a tracker lost them, without using its predictions."""
 
     def __init__(self, make_search: Callable[[], StartSearch], footage: Footage) -> None:
-        """Store a function that prepares a search, which takes time and is rarely needed, and the masks."""
+        # preparing a search takes time, and is rarely needed
         self._make_search, self._footage = make_search, footage
 
     def frames(self, lost: range, records: Mapping[int, FrameRecord]) -> list[int]:
-        """Return the most promising frames of a lost stretch, the best first.
-
-        Frames in which one arch was found come first, since they show where the head is.
+        """Return the most promising frames of a lost stretch, those in which one arch was found first.
 
         Raises:
             TrackingError: no frame has masks of both arches in enough cameras.
@@ -44,12 +42,8 @@ class LostSearch:
     def at(self, frame: int, poses: Array, *, everywhere: bool) -> Array | None:
         """Return T_world_upper and T_world_lower in a frame, shape (2, 4, 4), or None if the teeth do not fit clearly.
 
-        Args:
-            poses: poses near which the teeth are searched for, shape (2, 4, 4).
-            everywhere: whether to search for them everywhere if they are not found there, which takes longer.
-
-        Raises:
-            CaptureError: a mask cannot be read.
+        The teeth are searched for near the given poses (2, 4, 4) and, if `everywhere`, then everywhere, which takes
+        longer. Raises CaptureError if a mask cannot be read.
         """
         near = self._clear(partial(self._search.near, self._footage, frame, poses))
         if near is None and everywhere:

@@ -28,13 +28,12 @@ from jawusd.tracking.contour.scan import prepare_scan
 from jawusd.tracking.contour.solver import ContourSolver
 from jawusd.tracking.contour.views import MaskViews, View, present_masks
 from jawusd.tracking.sequence.extrinsics import corrected_cameras
-from jawusd.tracking.sequence.kinematic_prior import KinematicPrior
+from jawusd.tracking.sequence.kinematic_prior import FEWEST_POSES, KinematicPrior, model_spread_mm
 from jawusd.tracking.sequence.smoothing import smooth_poses
 
 # Standard deviation of the worst landmark above which a frame is tracked again [mm]: about the error of a
 # three-parameter jaw model. Below it, masks alone are more accurate.
 _HARD_MM = 0.3
-_FEWEST_GOOD = 15  # minimum number of good frames for using the model as a prior
 
 
 def hard_frames(tracks: Tracks) -> Mask:
@@ -59,13 +58,8 @@ def refine_tracks(
     """Track the hard frames again with the fitted model as a prior on the relative pose.
 
     The function changes final poses, `prior_aided`, and the uncertainties of lost frames. It leaves raw poses
-    unchanged, so that no model is fitted to poses influenced by its own prior, or evaluated on them.
-
-    Args:
-        tracks: result of the first pass.
-        jaw: the jaw model fitted to the tracks.
-        capture, cameras, offsets, upper, lower, config, threads: as for `track_capture`.
-        progress: called with the number of hard frames done and the total number of hard frames.
+    unchanged, so that no model is fitted to poses influenced by its own prior. Arguments are as for `track_capture`;
+    `progress` is called with the number of hard frames done and their total.
 
     Raises:
         CaptureError: a mask cannot be read.
@@ -74,12 +68,12 @@ def refine_tracks(
     hard = np.flatnonzero(hard_frames(tracks))
     measured = np.asarray(np.isfinite(tracks.raw_T_upper_lower).all((1, 2)))
     good = measured & ~hard_frames(tracks)
-    if not len(hard) or good.sum() < _FEWEST_GOOD:
+    if not len(hard) or good.sum() < FEWEST_POSES:
         return tracks
     scans = (prepare_scan(upper, "upper"), prepare_scan(lower, "lower"))
     table = {camera.name: camera for camera in corrected_cameras(cameras, tracks.meta)}
     middle = np.mean([transform_point(tracks.T_world_upper[good][0], s.centre) for s in scans], axis=0)
-    prior = KinematicPrior(jaw, _spread_mm(jaw, tracks, good))
+    prior = KinematicPrior(jaw, model_spread_mm(jaw, tracks.raw_T_upper_lower[good]))
     starts = _starts(tracks, jaw, measured)
     found: dict[int, _Refined] = {}
     with (
@@ -112,8 +106,8 @@ class _SecondPass:
     def __init__(self, solver: ContourSolver, config: TrackingConfig, prior: KinematicPrior, tracks: Tracks) -> None:
         self._solver, self._config, self._prior, self._tracks = solver, config, prior, tracks
         self._usual_px = np.nanmedian(np.where(tracks.status == TRACKED, tracks.residual_px, np.nan), axis=0)
-        self._outline_weight = 1.0 / _variances(tracks)
-        self._correlation_px = float(tracks.meta.get("correlation_px", config.correlation_px))
+        self._correlation_px = float(tracks.meta["correlation_px"])
+        self._outline_weight = 1.0 / (self._usual_px**2 * self._correlation_px)
 
     def align(self, k: int, start: Array, views: Sequence[View]) -> _Refined | None:
         """Return the poses of frame index k aligned with the prior, or None if they are unreliable."""
@@ -135,30 +129,14 @@ class _SecondPass:
         few = matched_px(solution) < c.least_matched_px
         relative = relative_pose(*solution.poses)
         sigma = landmark_sigmas(relative, _relative_covariance(solution.poses, covariance), jaw.landmarks)
-        verdict = jaw.validate(relative)
-        return bool(
-            uncovered <= c.lost_coverage and not rough.any() and not few.any() and sigma.max() <= c.lost_sigma_mm
-            and verdict.valid
-        )  # fmt: skip
-
-
-def _spread_mm(jaw: JawRig, tracks: Tracks, good: Mask) -> float:
-    """Return the rms landmark distance of good raw poses from the model [mm], including tracking noise."""
-    residual_mm = jaw.encode(tracks.raw_T_upper_lower[good])[1]
-    return float(np.sqrt(np.mean(residual_mm**2)))
-
-
-def _variances(tracks: Tracks) -> Array:
-    """Return the outline variance times correlation length per arch [px^3], shape (2,)."""
-    typical = np.nanmedian(np.where(tracks.status == TRACKED, tracks.residual_px, np.nan), axis=0)
-    return typical**2 * float(tracks.meta["correlation_px"])
+        masks_fit = uncovered <= c.lost_coverage and not rough.any() and not few.any()
+        return bool(masks_fit and sigma.max() <= c.lost_sigma_mm and jaw.validate(relative).valid)
 
 
 def _starts(tracks: Tracks, jaw: JawRig, measured: Mask) -> Array:
     """Return start poses of every frame, T_world_upper and T_world_lower, shape (F, 2, 4, 4).
 
-    A lost arch is placed from the other one with the jaw parameters interpolated between measured frames. If both are
-    lost, the head pose is interpolated linearly.
+    A lost arch is placed from the other one with interpolated jaw parameters, lost heads are interpolated linearly.
     """
     frames = tracks.frames.astype(np.float64)
     d = jaw.interpolate(frames[measured], jaw.encode(tracks.raw_T_upper_lower[measured], inside=True)[0], frames)
@@ -222,14 +200,13 @@ def _merged(tracks: Tracks, jaw: JawRig, found: Mapping[int, _Refined]) -> Track
     lower = tracks.T_world_lower.copy()
     both = np.isfinite(upper).all((1, 2)) & np.isfinite(relative).all((1, 2))
     lower[both] = upper[both] @ relative[both]
-    aided_frames = np.isin(np.arange(len(tracks.frames)), list(found))
     return replace(
         tracks,
         T_world_upper=upper,
         T_world_lower=lower,
         T_upper_lower=relative,
         status=status,
-        prior_aided=aided_frames,
+        prior_aided=np.isin(np.arange(len(tracks.frames)), list(found)),
         covariance_relative=spread,
         sigma_mm=sigma,
         **covariance,

@@ -8,41 +8,32 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from jawusd.base.arrays import Array
+from jawusd.geometry import se3_adjoint
 from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.contour.annotator import DRAWN, AnnotatorPrior, bias_layers
-from jawusd.tracking.contour.equations import Solution, motion_about
+from jawusd.tracking.contour.equations import Solution, motion_about, translation
 from jawusd.tracking.contour.frame_record import FrameRecord
 from jawusd.tracking.contour.scan import ARCHES
 from jawusd.tracking.sequence.delays import interpolation_errors, velocity_twist
-from jawusd.tracking.sequence.extrinsics import Extrinsics, twist_transfer
+from jawusd.tracking.sequence.extrinsics import Extrinsics
 
 
 @dataclass(frozen=True, eq=False)
 class Nuisances:
-    """Nuisance parameters common to all frames of a take.
+    """Nuisance parameters common to all frames of a take, with the standard deviations of these estimates."""
 
-    Attributes:
-        delays: exposure times relative to the first camera [frames], shape (C,): the image of camera c for a frame was
-            taken at time frame + delays[c].
-        habits: outward mask bias, per arch and camera, shape (2, C, 3): at tooth edges and at the gum line [px at
-            working resolution], and along the crown surface at the gum line [mm]; see `OutlineSums`.
-        shift_px: the resulting mean shift of edges and gum line, shape (2, C, 2).
-        sigma_delays, sigma_habits, sigma_shift_px: standard deviations of these estimates.
-        twists, sigma_twists: corrections of the camera poses as in `Extrinsics`, shape (C, 6).
-        contour_px: rms contour shift caused by the twists, without the part that poses of the teeth compensate [px].
-        covariance: covariance of all unknowns in the order of `TakeEquations`, zero where not estimated, shape (U, U).
-    """
-
+    #: exposure times relative to the first camera [frames], shape (C,): the image of camera c for a frame was taken at
+    #: time frame + delays[c]
     delays: Array
-    habits: Array
-    shift_px: Array
+    habits: Array  # outward mask bias, per arch and camera, with the components of `OutlineSums`, shape (2, C, 3)
+    shift_px: Array  # the resulting mean shift of edges and gum line, shape (2, C, 2)
     sigma_delays: Array
     sigma_habits: Array
     sigma_shift_px: Array
-    twists: Array
+    twists: Array  # corrections of the camera poses as in `Extrinsics`, shape (C, 6)
     sigma_twists: Array
-    contour_px: float
-    covariance: Array
+    contour_px: float  # rms contour shift by the twists, without the part that poses of the teeth compensate [px]
+    covariance: Array  # of all unknowns in the order of `TakeEquations`, zero where not estimated, shape (U, U)
 
     def plus(self, more: Nuisances) -> Nuisances:
         """Return the sum of these estimates and further estimates of delays and annotator biases."""
@@ -111,8 +102,7 @@ class TakeEquations:
 
     The residual of a sample is d = J (x + delay_c v + A y_c) + h . b_c with the pose correction x of its frame, the
     arch's velocity v, the camera's twist y_c transferred to the arch's centre by A, and the biases b_c of the masks.
-    Delays, biases and twists are shared by all frames. The resulting system is block-diagonal with a border, and is
-    solved by its Schur complement (as in bundle adjustment, Triggs et al. 1999).
+    The system is block-diagonal with a border, and is solved by its Schur complement (Triggs et al. 1999).
     """
 
     def __init__(
@@ -126,7 +116,6 @@ class TakeEquations:
         """Sum over the given frames (default: all); lost arches and frames without both neighbours are skipped.
 
         Args:
-            records: records by frame.
             variance_px3: outline variance times correlation length per arch [px^3], shape (2,).
             extrinsics: the camera poses used for the alignment.
             annotator: prior of the mask biases.
@@ -152,10 +141,7 @@ class TakeEquations:
                     self._gum[arch] += solution.outline.habit_weight[arch, :, 1, 1:]
 
     def observe(self, slope: Array, deviation: Array, precision: Array) -> None:
-        """Add an observation that does not come from masks: deviation + slope @ unknowns = 0 with a given precision.
-
-        `slope`, `deviation` and `precision` have shapes (n, U), (n,) and (n, n).
-        """
+        """Add an observation not from masks: deviation (n,) + slope (n, U) @ unknowns = 0 with precision (n, n)."""
         self._seen_S += slope.T @ precision @ slope
         self._seen_r -= slope.T @ precision @ deviation
 
@@ -242,7 +228,7 @@ def _reduced(
     The response is the twist about the arch's centre per unit of the unknowns, shape (6, U).
     """
     outline, size = solution.outline, layout.size
-    to_centre = twist_transfer(pivot, solution.centres[arch])
+    to_centre = se3_adjoint(translation(pivot - solution.centres[arch]))
     S, r, B = np.zeros((size, size)), np.zeros(size), np.zeros((6, size))
     for c in range(layout.cameras):
         H, g = outline.precision[arch, c], outline.gradient[arch, c]

@@ -26,12 +26,8 @@ from jawusd.tracking.sequence.lost_search import LostSearch
 
 Progress = Callable[[int, int], None]
 
-# Maximum number of frames around a restart from which the tracker is initialised: without this limit, long takes with
-# many gaps would take quadratic time.
-_NEARBY_FRAMES = 4000
-# Number of lost frames after which tracking backwards ends: wrong masks often last for a few frames, and with masks,
-# trying a lost frame takes little time.
-_PATIENCE = 16
+_NEARBY_FRAMES = 4000  # frames around a restart from which the tracker is initialised: all would take quadratic time
+_PATIENCE = 16  # lost frames after which tracking backwards ends: wrong masks often last for a few frames
 
 
 class Passes:
@@ -56,13 +52,8 @@ class Passes:
     def track_from(self, frame: int, poses: Array, search: LostSearch) -> None:
         """Track from the given frame in both directions, and backwards from frames before which poses may be wrong.
 
-        In lost frames with masks, the teeth are then searched for.
-
-        Args:
-            frame: reference frame number.
-            poses: T_world_scan of both arches in that frame, close enough for the alignment to converge, shape (2, 4,
-                4).
-            search: finds the teeth where they were lost.
+        In lost frames with masks, the teeth are then searched for. `poses` are T_world_scan of both arches in the
+        frame, close enough for the alignment to converge, shape (2, 4, 4).
 
         Raises:
             TrackingError: the teeth do not fit the masks of that frame.
@@ -84,9 +75,7 @@ class Passes:
     def _found_in(self, search: LostSearch, budget: SearchBudget, lost: range, near: FrameRecord) -> Begin[FrameRecord]:
         """Search for the teeth in a lost stretch, where they must fit as well as in other frames.
 
-        Raises:
-            TrackingError: the teeth were not found.
-            CaptureError: a mask cannot be read.
+        Raises TrackingError if the teeth were not found.
         """
         for frame in search.frames(lost, self.records):
             if budget.allows(frame):
@@ -140,10 +129,7 @@ class Passes:
         return sorted(known, key=lambda other: -abs(other - frame))[-_NEARBY_FRAMES:]
 
     def _walk(self, way: range, near: FrameRecord, without: Container[int] = ()) -> Iterator[FrameRecord]:
-        """Yield the records of frames in tracking order, next to a given one.
-
-        The tracker is initialised from the frames tracked before. Arches that were lost before count as recovered.
-        """
+        """Yield the records of frames in tracking order, next to a given one; arches lost before count as recovered."""
         beside = way.start - way.step
         tracker = self.tracker_beside(beside, without)
         motion = MotionPredictor(near.solution.poses, self._probes)
@@ -185,19 +171,15 @@ _POOR_SHARE, _POOR_RESIDUAL, _TELLING_FRAMES = 0.5, 1.6, 6
 
 
 def nearest_well_seen(records: Mapping[int, FrameRecord], start: int) -> int | None:
-    """Return the frame nearest to a given one in which both arches fit as well as usual in the take.
-
-    Return None if there is no such frame.
-    """
+    """Return the frame nearest to a given one in which both arches fit as well as usual in the take, or None."""
     frames = [frame for frame, record in records.items() if (record.status == TRACKED).all()]
     if not frames:
         return None
     scores = np.array([score_px(records[frame].solution).sum(1) for frame in frames])
     residuals = np.array([residual_px(records[frame].solution) for frame in frames])
-    well = (scores >= _LEAST_SCORE * np.median(scores, axis=0)) & (
-        residuals <= _MOST_RESIDUAL * np.median(residuals, axis=0)
-    )
-    seen = np.array(frames)[well.all(1)]
+    good = scores >= _LEAST_SCORE * np.median(scores, axis=0)
+    good &= residuals <= _MOST_RESIDUAL * np.median(residuals, axis=0)
+    seen = np.array(frames)[good.all(1)]
     return min(seen.tolist(), key=lambda frame: (abs(frame - start), frame), default=None)
 
 

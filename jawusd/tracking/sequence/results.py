@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from jawusd.base.arrays import Array, Mask
 from jawusd.formats.notes import TracksMeta
 from jawusd.formats.tracks import LOST, Tracks
-from jawusd.geometry import relative_pose, se3_adjoint
+from jawusd.geometry import se3_adjoint
 from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.contour.equations import Solution, translation
 from jawusd.tracking.contour.frame_record import FrameRecord
@@ -20,27 +20,26 @@ from jawusd.tracking.contour.quality import (
     correlation_px,
     landmark_sigmas,
     matched_px,
-    relative_covariance,
     residual_px,
     twist_covariance,
 )
 from jawusd.tracking.contour.scan import ARCHES
 from jawusd.tracking.sequence.closed_bite import (
+    STEADY,
     ClosedBite,
     RestFrames,
     check_registration,
     closed_bite,
     registration_findings,
     registration_unknown,
-    steady_part,
 )
 from jawusd.tracking.sequence.extrinsics import Extrinsics
 from jawusd.tracking.sequence.nuisance import Nuisances, interpolation_covariance, pose_response
-from jawusd.tracking.sequence.smoothing import smooth_poses
+from jawusd.tracking.sequence.smoothing import relative_covariances, relative_poses, smooth_poses
 
-#: Function that refines all measured poses with further information. Its arguments and results are poses (F, 2, 4, 4),
-#: NaN where lost, the covariances of their left twists about the world origin (F, 2, 6, 6), and those of
-#: T_upper_lower's left twists about the skull origin (F, 6, 6).
+#: Refines all measured poses with further information. Arguments and results are poses (F, 2, 4, 4), NaN where lost,
+#: the covariances of their left twists about the world origin (F, 2, 6, 6), and those of T_upper_lower's left twists
+#: about the skull origin (F, 6, 6).
 Fusion = Callable[[Array, Array, Array], tuple[Array, Array, Array]]
 
 
@@ -73,7 +72,7 @@ def assemble(
     known = status != LOST
     middle = np.median(centres[known.all(1)] if known.all(1).any() else centres, axis=(0, 1))
     final = np.stack([smooth_poses(frames, raw[:, r], covariance[:, r], middle) for r in ARCHES], axis=1)
-    raw_relative, relative = _relative(raw), _relative(final)
+    raw_relative = relative_poses(raw)
     meta: TracksMeta = {
         "tracking": asdict(config),
         "correlation_px": correlation,
@@ -88,7 +87,7 @@ def assemble(
         frames=frames,
         T_world_upper=final[:, 0],
         T_world_lower=final[:, 1],
-        T_upper_lower=relative,
+        T_upper_lower=relative_poses(final),
         raw_T_world_upper=raw[:, 0],
         raw_T_world_lower=raw[:, 1],
         raw_T_upper_lower=raw_relative,
@@ -144,13 +143,13 @@ def _measured(
     frames = np.array(sorted(records), np.int64)
     outline, habits = _covariances(records, correlation, nuisances, extrinsics)
     bite = closed_bite(frames, raw, outline, habits, rest)
-    covariance, steady = outline + habits, steady_part(outline, habits)
+    covariance, steady = outline + habits, STEADY * outline + habits
     del outline, habits  # free arrays that are as large as the tracks themselves
-    relative = _relative_covariance(raw, covariance)
+    relative = relative_covariances(raw, covariance)
     if bite is None:
         return raw, covariance, relative, None
     still = np.broadcast_to(np.eye(4), (len(frames), 4, 4))
-    relative = bite.reduce(relative, _relative_covariance(raw, steady), still, 2)
+    relative = bite.reduce(relative, relative_covariances(raw, steady), still, 2)
     for r in ARCHES:
         covariance[:, r] = bite.reduce(covariance[:, r], steady[:, r], raw[:, r], r)
     return bite.correct(raw, rest.apply), covariance, relative, bite
@@ -228,19 +227,3 @@ def _covariances(
             outline[k, r] = twist_covariance(record.solution, r, sigma[r], correlation) + between
             habits[k, r] = response @ nuisances.covariance @ response.T
     return outline, habits
-
-
-def _relative(poses: Array) -> Array:
-    """Return T_upper_lower, NaN where an arch is lost, shape (F, 4, 4)."""
-    out = np.full((len(poses), 4, 4), np.nan)
-    both = np.isfinite(poses).all((1, 2, 3))
-    out[both] = relative_pose(poses[both, 0], poses[both, 1])
-    return out
-
-
-def _relative_covariance(poses: Array, covariance: Array) -> Array:
-    """Return the covariance of T_upper_lower's left twist, NaN where an arch is lost, shape (F, 6, 6)."""
-    out = np.full((len(poses), 6, 6), np.nan)
-    both = np.isfinite(poses).all((1, 2, 3))
-    out[both] = relative_covariance(poses[both, 0], covariance[both, 0], covariance[both, 1])
-    return out

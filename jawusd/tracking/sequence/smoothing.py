@@ -22,10 +22,9 @@ from jawusd.geometry import (
     transform_points,
 )
 from jawusd.tracking.contour.quality import landmark_sigmas, relative_covariance
+from jawusd.tracking.contour.scan import ARCH_NAMES, ARCHES
 
-# Number of frames on either side over which process noise is estimated: the whole window is a third of a second at 24
-# fps.
-_WINDOW = 4
+_WINDOW = 4  # frames on either side over which process noise is estimated: a third of a second in all at 24 fps
 # Minimum variance of second differences, relative to the variance expected from independent noise [-]: outline errors
 # common to neighbouring frames cancel in second differences.
 _FLOOR = 0.5
@@ -36,9 +35,8 @@ def smooth_poses(frames: NDArray[np.int64], poses: Array, covariance: Array, cen
     """Return poses smoothed over time by a fixed-interval smoother.
 
     The smoother minimises sum x_k^T C_k^-1 x_k + sum a_k^T Q_k^-1 a_k over left twists x_k about a fixed point, with
-    pose covariances C_k and second differences a_k of the poses. This corresponds to a random walk in velocity (Rauch,
-    Tung & Striebel 1965). The process noise Q_k is estimated from nearby second differences of the raw poses less their
-    measurement noise, so that sudden stops are preserved.
+    pose covariances C_k and second differences a_k of the poses (Rauch, Tung & Striebel 1965). The process noise Q_k is
+    estimated from nearby second differences less their measurement noise, so that sudden stops are preserved.
 
     Lost frames remain NaN, and runs of fewer than five frames remain unchanged.
 
@@ -98,47 +96,55 @@ def combine(tracks: Tracks, poses: Array, covariance: Array, landmarks: Array) -
     """Return tracks combined with a second measurement of their poses, each weighted by its covariance.
 
     If the two measurements contradict each other, the covariance is scaled by the Birge ratio (Birge 1932). For lost
-    arches, the second measurement is used.
+    arches, the second measurement is used. The combined poses are smoothed again.
 
     Args:
-        tracks: the first measurement; its raw poses are combined with the second one and smoothed again.
         poses: T_world_upper and T_world_lower, NaN where they were not found, shape (F, 2, 4, 4).
         covariance: covariance of the poses' left twists about the world origin, shape (F, 2, 6, 6).
         landmarks: points whose uncertainty is reported, in mandible coordinates [mm], shape (5, 3).
     """
-    raw, spread, status = [], [], tracks.status.copy()
-    for r, name in enumerate(("upper", "lower")):
+    raw, spread, status = np.empty_like(poses), np.empty_like(covariance), tracks.status.copy()
+    for r, name in enumerate(ARCH_NAMES):
         own, own_covariance = getattr(tracks, f"raw_T_world_{name}"), getattr(tracks, f"covariance_{name}")
-        pose, variance = _weighted(own, own_covariance, poses[:, r], covariance[:, r])
-        found = np.isfinite(pose).all((1, 2))
+        raw[:, r], spread[:, r] = _weighted(own, own_covariance, poses[:, r], covariance[:, r])
+        found = np.isfinite(raw[:, r]).all((1, 2))
         status[found & (status[:, r] == LOST), r] = RECOVERED
-        raw.append(pose)
-        spread.append(variance)
-    both = np.asarray(np.isfinite(raw).all((0, 2, 3)))
+    both = np.isfinite(raw).all((1, 2, 3))
     if not both.any():
         return tracks
-    middle = np.median(transform_points(raw[1][both], landmarks[:3]).reshape(-1, 3), axis=0)
-    final = [smooth_poses(tracks.frames, pose, variance, middle) for pose, variance in zip(raw, spread, strict=True)]
-    raw_relative, relative, between = (np.full((len(both), n, n), np.nan) for n in (4, 4, 6))
-    raw_relative[both], relative[both] = (
-        relative_pose(raw[0][both], raw[1][both]),
-        relative_pose(*(f[both] for f in final)),
-    )
-    between[both] = relative_covariance(raw[0][both], spread[0][both], spread[1][both])
+    middle = np.median(transform_points(raw[both, 1], landmarks[:3]).reshape(-1, 3), axis=0)
+    final = np.stack([smooth_poses(tracks.frames, raw[:, r], spread[:, r], middle) for r in ARCHES], axis=1)
+    raw_relative, between = relative_poses(raw), relative_covariances(raw, spread)
     return replace(
         tracks,
-        T_world_upper=final[0],
-        T_world_lower=final[1],
-        T_upper_lower=relative,
-        raw_T_world_upper=raw[0],
-        raw_T_world_lower=raw[1],
+        T_world_upper=final[:, 0],
+        T_world_lower=final[:, 1],
+        T_upper_lower=relative_poses(final),
+        raw_T_world_upper=raw[:, 0],
+        raw_T_world_lower=raw[:, 1],
         raw_T_upper_lower=raw_relative,
         status=status,
-        covariance_upper=spread[0],
-        covariance_lower=spread[1],
+        covariance_upper=spread[:, 0],
+        covariance_lower=spread[:, 1],
         covariance_relative=between,
         sigma_mm=landmark_sigmas(raw_relative, between, landmarks),
     )
+
+
+def relative_poses(poses: Array) -> Array:
+    """Return T_upper_lower (F, 4, 4) of poses of both arches (F, 2, 4, 4), NaN where an arch is lost."""
+    out = np.full((len(poses), 4, 4), np.nan)
+    both = np.isfinite(poses).all((1, 2, 3))
+    out[both] = relative_pose(poses[both, 0], poses[both, 1])
+    return out
+
+
+def relative_covariances(poses: Array, covariance: Array) -> Array:
+    """Return the covariance of T_upper_lower's left twist, NaN where an arch is lost, shape (F, 6, 6)."""
+    out = np.full((len(poses), 6, 6), np.nan)
+    both = np.isfinite(poses).all((1, 2, 3))
+    out[both] = relative_covariance(poses[both, 0], covariance[both, 0], covariance[both, 1])
+    return out
 
 
 def _weighted(one: Array, one_covariance: Array, other: Array, other_covariance: Array) -> tuple[Array, Array]:
@@ -154,9 +160,8 @@ def _weighted(one: Array, one_covariance: Array, other: Array, other_covariance:
     gain = one_covariance[k] @ np.linalg.inv(one_covariance[k] + other_covariance[k])
     pose[k] = orthonormalise(se3_exp(np.einsum("nij,nj->ni", gain, apart)) @ one[k])
     remaining = one_covariance[k] - gain @ one_covariance[k]
-    square = np.einsum(
-        "ni,ni->n", apart, np.linalg.solve(one_covariance[k] + other_covariance[k], apart[..., None])[..., 0]
-    )
+    solved = np.linalg.solve(one_covariance[k] + other_covariance[k], apart[..., None])[..., 0]
+    square = np.einsum("ni,ni->n", apart, solved)
     birge = np.maximum(1.0, square / apart.shape[1])
     covariance[k] = 0.5 * birge[:, None, None] * (remaining + np.swapaxes(remaining, 1, 2))
     return pose, covariance

@@ -134,11 +134,11 @@ class _Take(Passes):
     def refine(self, rest: RestFrames, may_move: bool) -> tuple[Nuisances, Extrinsics]:
         """Estimate delays, annotator biases and camera poses; correct significant ones and align all frames again.
 
-        Camera poses are corrected only if `may_move`, since wrong lens parameters or scan sizes have similar effects as
-        moved cameras.
+        Camera poses are corrected only if `may_move`, since wrong lenses or scan sizes have similar effects.
         """
         c = self._config
-        extrinsics = Extrinsics.calibrated(self._masks.cameras, self._middle())
+        middle = np.median([record.solution.centres for record in self.records.values()], axis=(0, 1))
+        extrinsics = Extrinsics.calibrated(self._masks.cameras, middle)
         equations = self._equations(extrinsics, rest)
         known = self._late_cameras(equations, extrinsics, rest)
         if known is not None:
@@ -177,10 +177,9 @@ class _Take(Passes):
         return found
 
     def scans_and_lenses(self, left: Array) -> list[Finding]:
-        """Return findings about focal lengths, lens distortion and scans from the uncorrected take.
+        """Return findings about focal lengths, distortion and scans from the uncorrected take.
 
-        Args:
-            left: unit vector in scan coordinates, shape (3,).
+        `left` is a unit vector in scan coordinates, shape (3,).
         """
         whole = whole_frames(self.records)
         if not whole:
@@ -199,10 +198,6 @@ class _Take(Passes):
         equations = TakeEquations(self.records, variance, extrinsics, annotator=drawn_prior(self._solver.scans))
         observe_bite(equations, self.records, rest, extrinsics, variance)
         return equations
-
-    def _middle(self) -> Array:
-        """Return the centre of the teeth in world coordinates [mm], shape (3,)."""
-        return np.median([record.solution.centres for record in self.records.values()], axis=(0, 1))
 
     def _settle(
         self, found: Nuisances, extrinsics: Extrinsics, rest: RestFrames, cameras_moved: bool

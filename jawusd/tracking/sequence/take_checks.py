@@ -18,6 +18,7 @@ from jawusd.tracking.contour.frame_record import FrameRecord, whole_frames
 from jawusd.tracking.contour.quality import residual_px, score_px
 from jawusd.tracking.contour.scan import ARCH_NAMES, Scan, mirrored
 from jawusd.tracking.contour.solver import ContourSolver
+from jawusd.tracking.initialization.bootstrap import SIZE_HINT, than
 from jawusd.tracking.initialization.magnification import Instant, Magnification
 from jawusd.tracking.sequence.extrinsics import Extrinsics
 from jawusd.tracking.sequence.history import SearchBudget
@@ -25,22 +26,14 @@ from jawusd.tracking.sequence.history import SearchBudget
 
 @dataclass(frozen=True)
 class LensLimits:
-    """Limits on the magnification of cameras, beyond which a warning is given.
+    """Limits on the magnification of cameras, beyond which a warning is given."""
 
-    Attributes:
-        scale, common: magnification error of one camera relative to the others, and of all cameras [-].
-        bend: change of magnification over 25 mm at the teeth [-].
-        bias_px: outline bias of a camera relative to the others [px].
-        clear: minimum significance of `scale` and `common` [standard deviations].
-        knock: motion of a camera relative to the others [standard deviations].
-    """
-
-    scale: float
-    common: float
-    bend: float
-    bias_px: float
-    clear: float
-    knock: float
+    scale: float  # magnification error of one camera relative to the others [-]
+    common: float  # magnification error of all cameras [-]
+    bend: float  # change of magnification over 25 mm at the teeth [-]
+    bias_px: float  # outline bias of a camera relative to the others [px]
+    clear: float  # minimum significance of `scale` and `common` [standard deviations]
+    knock: float  # motion of a camera relative to the others [standard deviations]
 
 
 #: Limits for drawn masks. Standard deviations of magnifications include possible camera motion along the optical axis.
@@ -64,8 +57,8 @@ _CLEARLY = 4.0  # minimum significance for a warning [standard deviations]
 def lens_findings(names: Sequence[str], found: Magnification, limits: LensLimits = OF_MASKS) -> list[Finding]:
     """Return findings about scans, focal lengths, lenses and masks from the magnification of the cameras.
 
-    Kinds of the findings, with the units of their values: "scan_size" [%], "focal_length" [%], "camera_moved"
-    [degrees], "lens_distortion" [%], "side_teeth" [%], "masks_wide" [px].
+    Kinds and units: "scan_size" [%], "focal_length" [%], "camera_moved" [degrees], "lens_distortion" [%], "side_teeth"
+    [%], "masks_wide" [px].
     """
     out = []
     knocked = _knocked(found, limits)
@@ -76,11 +69,11 @@ def lens_findings(names: Sequence[str], found: Magnification, limits: LensLimits
             Finding(
                 "scan_size",
                 "warning",
-                f"every camera shows the teeth {_than(common)} than the scans: the scale of the scans or of the "
+                f"every camera shows the teeth {than(common)} than the scans: the scale of the scans or of the "
                 f"calibration is wrong; a difference of at most {limits.common:.1%} is usual.",
                 value=round(100 * common, 2),
                 limit=100 * limits.common,
-                hint="Check the scans' unit and scaling, and the square size of the calibration board.",
+                hint=SIZE_HINT,
             )
         )
     for c, name in enumerate(names):
@@ -90,7 +83,7 @@ def lens_findings(names: Sequence[str], found: Magnification, limits: LensLimits
                 Finding(
                     "focal_length",
                     "warning",
-                    f"this camera shows the teeth {_than(own)} than expected from its calibration and the others; "
+                    f"this camera shows the teeth {than(own)} than expected from its calibration and the others; "
                     f"at most {limits.scale:.0%} is usual. Its focal length or its distance is wrong.",
                     value=round(100 * own, 2),
                     limit=100 * limits.scale,
@@ -138,7 +131,7 @@ def _bent(name: str, bend: float, limits: LensLimits) -> Finding:
         return Finding(
             "side_teeth",
             "warning",
-            f"this camera's masks show the teeth {_than(bend)} at 25 mm from the optical axis than in the centre; no "
+            f"this camera's masks show the teeth {than(bend)} at 25 mm from the optical axis than in the centre; no "
             f"lens distorts by more than {_MOST_BEND:.1%} there. The masks of the side teeth are wrong.",
             value=round(100 * bend, 2),
             limit=100 * _MOST_BEND,
@@ -148,7 +141,7 @@ def _bent(name: str, bend: float, limits: LensLimits) -> Finding:
     return Finding(
         "lens_distortion",
         "warning",
-        f"this camera shows the teeth {_than(bend)} at 25 mm from the optical axis than its calibration predicts; "
+        f"this camera shows the teeth {than(bend)} at 25 mm from the optical axis than its calibration predicts; "
         f"at most {limits.bend:.1%} is usual. Its lens distortion is wrong.",
         value=round(100 * bend, 2),
         limit=100 * limits.bend,
@@ -157,20 +150,11 @@ def _bent(name: str, bend: float, limits: LensLimits) -> Finding:
     )
 
 
-def _than(share: float) -> str:
-    return f"{abs(share):.1%} {'larger' if share > 0 else 'smaller'}"
-
-
 def _wide(name: str, c: int, found: Magnification, limits: LensLimits) -> list[Finding]:
     """Return a warning if the mask outlines of a camera lie far outside or inside those of the others."""
     own = found.bias_px[c] - np.median(found.bias_px, axis=0)
-    bias = float(own.mean())
-    if len(found.bias_px) < _TELLING_CAMERAS:
-        return []
-    if (
-        np.abs(own).min() < max(limits.bias_px, _CLEARLY * float(found.sigma_bias_px[c].max()))
-        or own.min() * own.max() < 0
-    ):
+    bias, least = float(own.mean()), max(limits.bias_px, _CLEARLY * float(found.sigma_bias_px[c].max()))
+    if len(found.bias_px) < _TELLING_CAMERAS or np.abs(own).min() < least or own.min() * own.max() < 0:
         return []
     return [
         Finding(
@@ -187,10 +171,7 @@ def _wide(name: str, c: int, found: Magnification, limits: LensLimits) -> list[F
 
 
 def motion_findings(names: Sequence[str], extrinsics: Extrinsics) -> list[Finding]:
-    """Return a warning for each camera that moved significantly since its calibration.
-
-    The kind of the finding is "camera_moved", its value an angle [degrees].
-    """
+    """Return a warning "camera_moved" [degrees] for each camera that moved significantly since its calibration."""
     out = []
     for name, twist, sigma in zip(names, extrinsics.twists, extrinsics.sigma, strict=True):
         turn, move = float(np.rad2deg(np.linalg.norm(twist[:3]))), float(np.linalg.norm(twist[3:]))
@@ -205,10 +186,7 @@ def motion_findings(names: Sequence[str], extrinsics: Extrinsics) -> list[Findin
 
 
 def misfit_findings(records: Mapping[int, FrameRecord]) -> list[Finding]:
-    """Return a warning for a scan that barely fits its own masks.
-
-    The kind of the finding is "scan_misfit", its value the matched fraction [% of the visible contour].
-    """
+    """Return a warning "scan_misfit" [% of the visible contour] for a scan that barely fits its own masks."""
     whole = [records[frame].solution for frame in whole_frames(records)]
     if len(whole) < _TELLING_FRAMES:
         return []
@@ -235,10 +213,7 @@ def misfit_findings(records: Mapping[int, FrameRecord]) -> list[Finding]:
 
 
 def search_findings(searches: SearchBudget, records: Mapping[int, FrameRecord]) -> list[Finding]:
-    """Return a warning if the search budget was exhausted, so that frames stay lost without a search.
-
-    The kind of the finding is "searches_left_out", its value a number of frames.
-    """
+    """Return a warning "searches_left_out" [frames] if frames stay lost without a search as the budget was used up."""
     lost = [f for f in sorted(searches.left_out) if ((records[f].status == LOST) & records[f].used.any(1)).any()]
     if not lost:
         return []
@@ -261,10 +236,7 @@ _HALF = 0.5  # minimum fraction of a camera's masks that are used; with fewer, i
 
 
 def use_of_cameras(names: tuple[str, ...], records: Mapping[int, FrameRecord]) -> list[Finding]:
-    """Return a warning for each camera whose masks were never or rarely used.
-
-    The kind of a finding is "camera_not_used" or "camera_rarely_used", its value the fraction of masks used.
-    """
+    """Return a warning "camera_not_used" or "camera_rarely_used" [fraction of masks used] for each such camera."""
     frames = sorted(records)
     present = np.array([np.isfinite(records[frame].coverage) for frame in frames])  # mask exists, shape (F, 2, C)
     used = np.array([records[frame].used for frame in frames])
@@ -308,32 +280,9 @@ _LEAST_RATIO = 1.15
 def mirror_findings(
     scans: Sequence[Scan], left: Array, instants: Iterable[Instant], config: TrackingConfig
 ) -> list[Finding]:
-    """Return a warning of kind "scans_mirrored" if mirrored scans (left and right exchanged) match more contour.
+    """Return a warning "scans_mirrored" if mirrored scans (left and right exchanged) match more contour.
 
-    Args:
-        scans: upper and lower scan.
-        left: unit vector to the left in scan coordinates, shape (3,).
-        instants: some aligned frames of the take.
-    """
-    ratio = mirror_ratio(scans, left, instants, config)
-    if not ratio > _LEAST_RATIO:
-        return []
-    return [
-        Finding(
-            "scans_mirrored",
-            "warning",
-            f"mirrored scans match {ratio:.2f} times as much of the outlines: left and right are exchanged",
-            value=round(ratio, 2),
-            limit=_LEAST_RATIO,
-            hint="Export the scans again without mirroring; one axis may have been negated.",
-        )
-    ]
-
-
-def mirror_ratio(scans: Sequence[Scan], left: Array, instants: Iterable[Instant], config: TrackingConfig) -> float:
-    """Return the ratio of contour matched by mirrored scans to contour matched by the given scans; NaN without frames.
-
-    The arguments are those of `mirror_findings`.
+    `left` is the unit vector to the left in scan coordinates, shape (3,); `instants` are some aligned frames.
     """
     middle = np.mean([scan.centre for scan in scans], axis=0)
     pair = [ContourSolver(own, config) for own in (scans, [mirrored(scan, middle, left) for scan in scans])]
@@ -343,5 +292,10 @@ def mirror_ratio(scans: Sequence[Scan], left: Array, instants: Iterable[Instant]
         poses, views, use = chosen[k]
         found = [solver.solve(poses, views, config.wide_gates_px, use) for solver in pair]
         shares.append([score_px(one).sum() / max(one.visible_px.sum(), 1.0) for one in found])
-    given, other = np.median(shares, axis=0) if shares else (np.nan, np.nan)
-    return float(other / given) if given > 0 else float("nan")
+    given, other = np.median(shares, axis=0).tolist() if shares else (0.0, 0.0)
+    ratio = other / given if given > 0 else 0.0
+    if not ratio > _LEAST_RATIO:
+        return []
+    message = f"mirrored scans match {ratio:.2f} times as much of the outlines: left and right are exchanged"
+    hint = "Export the scans again without mirroring; one axis may have been negated."
+    return [Finding("scans_mirrored", "warning", message, round(ratio, 2), _LEAST_RATIO, hint=hint)]

@@ -1,9 +1,8 @@
 """Synchronisation errors found in a tracked take: late or early cameras, and dropped or repeated frames.
 
-Delays shorter than a frame are estimated with linear equations (`TakeEquations`). Where the jaw moves fast, these
-equations fail for delays of a whole frame, because masks of the wrong frame are rejected or bias the jaw pose. With
-masks, neighbouring frames of each camera are therefore compared with the pose estimated from the other cameras. Without
-masks, a step in the delay is fitted.
+Where the jaw moves fast, the linear equations of `TakeEquations` fail for delays of a whole frame. With masks,
+neighbouring frames of each camera are therefore compared with the pose estimated from the other cameras. Without masks,
+a step in the delay is fitted.
 """
 
 from __future__ import annotations
@@ -42,30 +41,20 @@ _BETTER_FIT = 0.15
 
 
 class Shift(NamedTuple):
-    """A camera whose masks are shifted in time.
+    """A camera whose masks are shifted in time."""
 
-    Attributes:
-        camera: index of the camera.
-        frames: number of frames by which the camera is late; negative if it is early.
-        frame: first frame with the shift; None for the whole take.
-    """
-
-    camera: int
-    frames: int
-    frame: int | None
+    camera: int  # index of the camera
+    frames: int  # number of frames by which the camera is late; negative if it is early
+    frame: int | None  # first frame with the shift; None for the whole take
 
 
 @dataclass(frozen=True, eq=False)
 class FrameShifts:
-    """Fit of each camera's masks of neighbouring frames to the poses estimated from the other cameras.
+    """Fit of each camera's masks of neighbouring frames to the poses estimated from the other cameras."""
 
-    Attributes:
-        frames: the frames checked, shape (F,).
-        fit: matched contour less the penalty for uncovered mask, relative to the visible contour, for each frame,
-            camera and shift, shape (F, C, 3); NaN if the camera or all others have no mask.
-    """
-
-    frames: NDArray[np.int_]
+    frames: NDArray[np.int_]  # the frames checked, shape (F,)
+    #: matched contour less the penalty for uncovered mask, relative to the visible contour, for each frame, camera and
+    #: shift, shape (F, C, 3); NaN if the camera or all others have no mask
     fit: Array
 
     def clearest(self) -> Shift | None:
@@ -127,11 +116,6 @@ def frame_shifts(records: Mapping[int, FrameRecord], masks: MaskViews, solver: C
 
     If all masks are in sync at both ends of the take, the frames between are skipped: a delay there would have to
     appear and vanish again, which is unlikely.
-
-    Args:
-        records: records of all frames of the take.
-        masks: masks of the take.
-        solver: solver with the scans.
     """
     frames = _fast_frames(records)
     fit = np.full((len(frames), len(masks.cameras), len(SHIFTS)), np.nan)
@@ -217,12 +201,8 @@ def delay_steps(
 ) -> list[DelayStep]:
     """Return the most significant step in every camera's delay; an empty list with too few frames.
 
-    For every camera and frame in turn, an additional delay from that frame on is added to the unknowns of the take (see
-    `TakeEquations`), and all other unknowns are eliminated.
-
-    Args:
-        records, variance_px3, extrinsics: as for `TakeEquations`.
-        frames: frames in which both arches are tracked, in ascending order.
+    For every camera and frame in turn, an additional delay from that frame on is added to the unknowns of
+    `TakeEquations`, and all others are eliminated. `frames` are those with both arches, in ascending order.
     """
     if len(frames) < 2 * _LEAST_FRAMES:
         return []
@@ -271,18 +251,12 @@ def time_findings(
     config: TrackingConfig,
     shifts: FrameShifts | None = None,
 ) -> list[Finding]:
-    """Return warnings about cameras that are a frame late or early, throughout the take or from some frame on.
+    """Return warnings "camera_late" [frames] and "frame_dropped" [frames] about cameras that are late or early.
 
-    Args:
-        names: names of the cameras.
-        records: records of all frames.
-        nuisances, extrinsics, config: estimates and settings of the take.
-        shifts: fit of the masks of neighbouring frames; None without masks, when steps are found from delays shorter
-            than a frame.
-
-    Kinds of the findings, with the units of their values: "camera_late" [frames], "frame_dropped" [frames].
+    `shifts` is None without masks; steps are then found from delays shorter than a frame.
     """
-    late = {k: float(nuisances.delays[k]) for k in range(len(names)) if _is_late(nuisances, k)}
+    limits = np.maximum(_LATE_FRAMES, _CLEARLY * nuisances.sigma_delays)
+    late = {k: float(nuisances.delays[k]) for k in np.flatnonzero(np.abs(nuisances.delays) > limits).tolist()}
     if shifts is None:
         return [*_late(names, late), *_step_of_delay(names, records, extrinsics, config)]
     late = {camera: frames for camera, frames in late.items() if not shifts.is_timely(camera)}
@@ -292,11 +266,6 @@ def time_findings(
     if shift.frame is None:
         return _late(names, late or {shift.camera: float(shift.frames)})
     return [*_late(names, late), _dropped(names[shift.camera], shift.frames, shift.frame)]
-
-
-def _is_late(nuisances: Nuisances, camera: int) -> bool:
-    limit = max(_LATE_FRAMES, _CLEARLY * float(nuisances.sigma_delays[camera]))
-    return abs(float(nuisances.delays[camera])) > limit
 
 
 def _late(names: Sequence[str], frames: Mapping[int, float]) -> list[Finding]:
