@@ -26,31 +26,23 @@ class TrackingConfig:
     working_px_per_mm: float = 7.2
     # Spacing of contour samples [px]: less than the distance over which mask noise is correlated.
     sample_step_px: float = 3.0
-    # Residual gate of each iteration [px]: narrow at the end, since wider gates also match lip and gum edges 0.5 mm
-    # away.
+    # Residual gate of each iteration [px]: wider gates at the end would also match lip and gum edges 0.5 mm away.
     wide_gates_px: tuple[float, ...] = (14.0, 10.0, 8.0, 6.0, 4.0, 4.0, 4.0, 4.0, 4.0, 4.0)
     # First residual gate if motion is predictable [px]; wider gates are used for fast motion and as a fallback.
     first_gate_px: float = 6.0
     # Ratio of the first residual gate to the recent prediction error [-]: above 1, since the next error may be larger.
     gate_per_miss: float = 1.5
-    # Minimum and maximum of the final residual gate [px], which adapts to the spread of the residuals: it is 2 px for
-    # good hand-drawn masks.
+    # Limits of the final residual gate [px], which adapts to the residuals: 2 px for good hand-drawn masks.
     final_gate_px: tuple[float, float] = (1.2, 4.0)
-    # Residual above which a sample adds nothing to the score [px]; the same for all poses, so that scores are
-    # comparable.
-    score_gate_px: float = 2.5
+    score_gate_px: float = 2.5  # residual above which a sample adds nothing to the score [px], whatever the gate
     # Tukey gate in standard deviations: 95 % efficiency for normal noise (Huber & Ronchetti 2009).
     gate_sigmas: float = 4.685
-    # Weight of contour samples deep inside the mask while residual gates are wide [-]: it pushes out contours that
-    # start inside the mask.
+    # Weight of samples deep inside the mask while gates are wide [-]: it pushes out contours that start inside.
     pull: float = 0.3
-    # Residual gate up to which the weight `pull` is zero [px]: near the solution, this weight would favour gum over
-    # teeth.
-    pull_above_px: float = 4.0
+    pull_above_px: float = 4.0  # residual gate up to which this weight is zero [px]: it favours gum over teeth
     # Minimum cosine between contour and mask normals at a matched edge [-]: lips cross the contour at larger angles.
     normal_cosine: float = 0.7
-    # Maximum decrease in depth from a contour point to the pixel just inside it [mm]: a cusp curves by less, and
-    # another tooth in front is nearer by more.
+    # Maximum decrease in depth from a contour point to the pixel just inside it [mm]: more than for a cusp.
     depth_tolerance_mm: float = 1.5
     # Minimum depth difference for one arch to hide the other [mm]: larger than the error of the poses.
     overlap_tolerance_mm: float = 0.4
@@ -58,37 +50,25 @@ class TrackingConfig:
     converged_mm: float = 0.004
     # Pose update below which the intermediate residual gates are skipped [mm at the crowns]; 0 never skips them.
     settled_mm: float = 0.0
-    # Last pose update up to which residuals are not recomputed at the final pose [mm at the crowns]; 0 always
-    # recomputes them.
+    # Last pose update up to which residuals are not recomputed at the final pose [mm at the crowns]; 0: always.
     judged_mm: float = 0.0
     # Image motion after which a scan is rendered again [px]: the maximum error of occlusion boundaries.
     redraw_px: float = 1.0
-    # Parallax between near and far parts of a scan above which it is rendered again instead of warped [px]: at 4 px,
-    # corrections of the poses of knocked cameras become biased.
+    # Parallax within a scan above which it is rendered again, not warped [px]; see docs/explanation/constants.md.
     parallax_px: float = 2.0
-    # Standard deviation of an arch about its predicted position [mm]: a weak prior on motions that masks do not
-    # constrain.
-    prediction_mm: float = 0.5
-    # Outline variance times correlation length assumed by the prediction prior [px^3]: (0.4 px)^2 times 18 px, as for
-    # drawn masks.
+    prediction_mm: float = 0.5  # standard deviation of an arch about its predicted position [mm]: a weak prior
+    # Outline variance times correlation length of drawn masks [px^3]: (0.4 px)^2 times 18 px.
     typical_noise_px3: float = 3.0
     # Assumed correlation length of outline errors along the contour [px], until it is measured on the take.
     correlation_px: float = 18.0
-    # Known correlation length of outline errors [px], for residuals that cannot reveal it; None uses the measured
-    # value.
-    known_correlation_px: float | None = None
-    # Side of the tiles over which errors are summed to measure the correlation length [px]: estimates change little
-    # from 20 to 45.
+    known_correlation_px: float | None = None  # the same if residuals cannot reveal it; None: measured
+    # Side of the tiles of summed errors that reveal the correlation length [px]: 20 to 45 give the same.
     tile_px: int = 30
-    # Ratio of true to measured correlation length [-]: the fit absorbs part of the error, and the Tukey weight loses
-    # efficiency.
-    tile_factor: float = 2.2
+    tile_factor: float = 2.2  # ratio of true to measured correlation length [-]: the fit absorbs part of the error
     history_frames: int = 31  # number of recent good frames that define the usual residual and coverage: about a second
-    # Number of recent good frames that define the usual score: shorter than the time in which lips close, and longer
-    # than that in which a pose is lost.
+    # Number of recent good frames that define the usual score: fewer than those in which lips close.
     score_frames: int = 7
-    # Fraction of the recent median score below which the pose of an arch is suspect [-]: closing lips seldom hide so
-    # much of an arch in a few frames.
+    # Fraction of the recent score below which a pose is suspect [-]: lips seldom hide so much in a few frames.
     suspect_score: float = 0.6
     # Fraction of the recent median score below which closing lips do not sufficiently explain the drop in score [-].
     alarming_score: float = 0.3
@@ -105,15 +85,13 @@ class TrackingConfig:
     conflict_gain: float = 0.15
     # Minimum gain in the objective over the first attempt, relative to the score, for marking a frame as recovered [-].
     recovery_gain: float = 0.05
-    # Offsets of the starts of the multi-start search [mm, rad]: typical prediction errors in fast chewing, and after
-    # the teeth were hidden.
+    # Offsets of the starts of the multi-start search [mm, rad]: errors in fast chewing, and after a loss.
     search_rings: tuple[tuple[float, float], ...] = ((2.0, 0.05), (4.0, 0.12))
     # Residual gates of the short trial alignment from every start [px], and number of starts that are refined fully.
     trial_gates_px: tuple[float, ...] = (14.0, 8.0)
     search_finalists: int = 4
     least_matched_px: float = 60.0  # matched contour length below which an arch is lost [px]: 8 mm of tooth edge
-    # Multiple of the limit for suspect residuals above which an arch is lost [-]; if the score is low as well, a
-    # suspect residual suffices.
+    # Multiple of the limit for suspect residuals above which an arch is lost [-]; 1 if the score is low as well.
     lost_residual: float = 1.3
     # Uncovered fraction of a mask above which its arch is lost [-]: good poses leave about 0.01.
     lost_coverage: float = 0.12
@@ -126,16 +104,13 @@ class TrackingConfig:
     # smaller values matter less than the noise of a single frame.
     refine_delay_frames: float = 0.03
     refine_bias_px: float = 0.1
-    # Delay above which delays are corrected before camera poses are tested [frames]: larger than that between
-    # free-running cameras.
+    # Delay corrected before camera poses are tested [frames]: larger than between free-running cameras.
     late_frames: float = 0.6
     # Maximum number of rounds in which all frames are aligned again: each round reduces the remaining delay to a tenth.
     refine_rounds: int = 2
-    # Maximum number of rounds of aligning all frames again while a camera still has a delay, since matches then
-    # converge slowly.
+    # Maximum number of such rounds while a camera still has a delay, since matches then converge slowly.
     late_rounds: int = 4
-    # Contour shift due to wrong camera poses above which camera poses are corrected [px]: smaller shifts are due to
-    # annotator bias.
+    # Contour shift above which camera poses are corrected [px]: smaller ones are due to annotator bias.
     refine_shift_px: float = 0.15
     # Prior standard deviation of a camera's motion between calibration and take, per axis [rad, mm]: about what an
     # accidental knock causes.

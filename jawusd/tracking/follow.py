@@ -193,10 +193,7 @@ class TwoWays(Generic[P]):
         yield from self._unlike(way, follow(way, self.known[beside]), least_trust=2)
 
     def _unlike(self, way: range, followed: Iterator[P], least_trust: int = 0) -> Iterator[tuple[int, float]]:
-        """Yield the frames up to the first confirmed pose, and how far known and followed poses are apart [mm].
-
-        A pose is confirmed if it equals the followed one or fits clearly better, and is trusted enough; see `trust`.
-        """
+        """Yield the frames up to the first pose that is trusted and confirmed, and how far the poses are apart [mm]."""
         for frame, other in zip(way, followed, strict=False):
             old, away_mm = self.known[frame], self._apart_mm(other, self.known[frame])
             clear = away_mm < _SAME_MM or self.fit_px(old) > self.margin * self.fit_px(other)

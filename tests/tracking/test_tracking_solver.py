@@ -12,7 +12,7 @@ from jawusd.geometry import make_transform, rigidity_defect, se3_exp, se3_invers
 from jawusd.meshes.raster import draw_depth_labels, project
 from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.contour.correspondences import accumulate, search_edges
-from jawusd.tracking.contour.equations import NormalEquations, OutlineTerm
+from jawusd.tracking.contour.equations import NormalEquations, OutlineSums, OutlineTerm
 from jawusd.tracking.contour.samples import (
     COLUMNS,
     CROWN,
@@ -174,11 +174,9 @@ def test_normal_equations_agree_with_finite_differences():
     rng = np.random.default_rng(1)
     distances = rng.normal(size=len(samples)) * 0.5
     centre = transform_point(pose, SCANS[1].centre)
-    precision, gradient = np.zeros((6, 6)), np.zeros(6)
-    habit_slope, habit_distance, habit_weight = np.zeros((3, 6)), np.zeros(3), np.zeros((3, 3))
-    where = (pose, camera.projection_matrix(), centre)
-    tables = (precision, gradient, habit_slope, habit_distance, habit_weight)
-    sums = accumulate(samples, distances, 2.0, 2.5, 0.0, *where, *tables)
+    where, found = (pose, camera.projection_matrix(), centre), OutlineSums.zeros(1)
+    accumulate(samples, distances, (2.0, 2.5, 0.0), where, found, 1, 0)
+    precision, gradient, habit_slope, habit_distance, habit_weight, *sums = (table[1, 0] for table in found)
     h, J = 1e-5, np.empty((len(samples), 6))
     to, back = make_transform(np.eye(3), -centre), make_transform(np.eye(3), centre)
     for k in range(6):
@@ -198,7 +196,7 @@ def test_normal_equations_agree_with_finite_differences():
     assert np.allclose(habit_weight, habits.T @ (habits * weight[:, None]))
     matched = samples[np.abs(distances) < 2.0, LENGTH].sum()
     score = np.clip(1 - (distances / 2.5) ** 2, 0, None) ** 3 @ samples[:, LENGTH]
-    expected = (weight.sum(), weight @ distances**2, matched, score)
+    expected = [weight.sum(), weight @ distances**2, matched, score]
     assert sums == pytest.approx(expected)
 
 

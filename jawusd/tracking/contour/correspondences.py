@@ -52,10 +52,7 @@ def _at(picture: NDArray[np.float32], x: float, y: float) -> float:
 
 @numba.njit(nogil=True, cache=True)
 def _nearest_edge(mask: NDArray[np.uint8], x: float, y: float, nx: float, ny: float, reach: float) -> float:
-    """Return the signed distance [px] along the normal to the nearest edge where the mask ends.
-
-    It is NaN without an edge within reach, and positive infinity if the mask extends over the whole reach.
-    """
+    """Return the signed distance [px] to the nearest edge where the mask ends, NaN without one, inf deep inside."""
     start = _sample(mask, x, y)
     outer = inner = start
     steps = int(np.ceil(reach))
@@ -143,35 +140,31 @@ def _slope(sample: Array, pose: Array, matrix: Array, centre: Array, jacobian: A
 def accumulate(
     samples: Array,
     distances: Array,
-    gate_px: float,
-    score_gate_px: float,
-    pull: float,
-    pose: Array,
-    matrix: Array,
-    centre: Array,
-    precision: Array,
-    gradient: Array,
-    habit_slope: Array,
-    habit_distance: Array,
-    habit_weight: Array,
-) -> tuple[float, float, float, float]:
-    """Add the Tukey-weighted normal equations of one arch in one view; return four sums of `OutlineSums`.
+    limits: tuple[float, float, float],
+    where: tuple[Array, Array, Array],
+    sums: OutlineSums,
+    r: int,
+    c: int,
+) -> None:
+    """Add the Tukey-weighted normal equations of one arch r in one view c to sums.
 
     The residual d of a sample with image normal n decreases by n . du if the sample moves by du in the image; du is
-    caused by a left twist (omega, v) of the arch about `centre` (Drummond & Cipolla 2002 use the same distances).
+    caused by a left twist (omega, v) of the arch about a centre (Drummond & Cipolla 2002 use the same distances).
 
     Args:
         samples, distances: input and output of `search_edges`, shapes (n, COLUMNS) and (n,).
-        gate_px, score_gate_px: residuals above which the Tukey weight and the contribution to the score are zero.
-        pull: weight, at the gate, of samples deep inside the mask; 0 ignores these samples.
-        pose, matrix: scan to world, shape (4, 4); world [mm] to homogeneous px, shape (3, 4).
-        centre: centre of the twist in world coordinates [mm], shape (3,).
-        precision, gradient, habit_slope, habit_distance, habit_weight: incremented; see `OutlineSums`.
-
-    Returns:
-        weight, square, matched_px and score_px.
+        limits: residuals above which the Tukey weight and the contribution to the score are zero [px]; and the weight,
+            at the former, of samples deep inside the mask.
+        where: scan to world (4, 4), world [mm] to homogeneous px (3, 4), centre of the twist in the world (3,) [mm].
     """
-    sum_weight = sum_square = matched_px = score_px = 0.0
+    gate_px, score_gate_px, pull = limits
+    pose, matrix, centre = where
+    precision, gradient = sums.precision[r, c], sums.gradient[r, c]
+    habit_slope, habit_distance, habit_weight = (
+        sums.habit_slope[r, c],
+        sums.habit_distance[r, c],
+        sums.habit_weight[r, c],
+    )
     jacobian = np.empty(6)
     for s in range(len(samples)):
         d = distances[s]
@@ -186,12 +179,12 @@ def accumulate(
         else:
             e = 1.0 - (d / score_gate_px) ** 2
             if e > 0:
-                score_px += e * e * e * sample[LENGTH]
+                sums.score_px[r, c] += e * e * e * sample[LENGTH]
             e = 1.0 - (d / gate_px) ** 2
             if e <= 0:
                 continue
             weight = e * e
-            matched_px += sample[LENGTH]
+            sums.matched_px[r, c] += sample[LENGTH]
         weight *= sample[LENGTH]
         _slope(sample, pose, matrix, centre, jacobian)
         for i in range(6):
@@ -206,41 +199,8 @@ def accumulate(
                 habit_distance[a] += habit * d
                 for b in range(COLUMNS - EDGE_SHARE):
                     habit_weight[a, b] += habit * sample[EDGE_SHARE + b]
-        sum_weight += weight
-        sum_square += weight * d * d
-    return sum_weight, sum_square, matched_px, score_px
-
-
-@numba.njit(nogil=True, cache=True)
-def accumulate_outline(
-    r: int,
-    c: int,
-    samples: Array,
-    silhouettes: int,
-    distances: Array,
-    limits: tuple[float, float, float],
-    where: tuple[Array, Array, Array],
-    silhouette: OutlineSums,
-    margin: OutlineSums,
-) -> None:
-    """Write the normal-equation sums of one arch in one view, separately for silhouette and gingival margin.
-
-    Args:
-        r, c: arch and view; the sums must be zero there.
-        samples, distances: as for `accumulate`; the first `silhouettes` samples are those of the silhouette.
-        limits: gate, score gate and pull, as for `accumulate`.
-        where: pose, matrix and centre, as for `accumulate`.
-    """
-    for k in range(2):
-        sums = silhouette if k == 0 else margin
-        first, stop = (0, silhouettes) if k == 0 else (silhouettes, len(samples))
-        weight, square, matched_px, score_px = accumulate(
-            samples[first:stop], distances[first:stop], limits[0], limits[1], limits[2], where[0], where[1], where[2],
-            sums.precision[r, c], sums.gradient[r, c], sums.habit_slope[r, c], sums.habit_distance[r, c],
-            sums.habit_weight[r, c],
-        )  # fmt: skip
-        sums.weight[r, c], sums.square[r, c] = weight, square
-        sums.matched_px[r, c], sums.score_px[r, c] = matched_px, score_px
+        sums.weight[r, c] += weight
+        sums.square[r, c] += weight * d * d
 
 
 @numba.njit(nogil=True, cache=True)
@@ -262,7 +222,8 @@ def scatter_of_tiles(
     of the result to the normal matrix gives the correlation length (cluster-robust covariance, Liang & Zeger 1986).
 
     Args:
-        samples, distances, gate_px, pose, matrix, centre: as for `accumulate`.
+        samples, distances, pose, matrix, centre: as for `accumulate`.
+        gate_px: residual above which the Tukey weight is zero.
         shape: (h, w) of the image.
         tile_px: side of the square tiles, longer than the correlation length.
     """

@@ -33,8 +33,9 @@ def crown_gum_segments(
         return np.zeros((0, 2, 3)), np.zeros((0, 3))
     size = np.ptp(np.concatenate([crown, gum]), axis=1)
     cell = max(float(np.median(size.max(1))) * 1.5, float((high - low).max()) / 256, 1e-9)
-    starts, items = _grid(gum, low, cell, _cells(low, high, cell))
-    segments, owner = _cut(crown, gum, low, cell, _cells(low, high, cell), starts, items)
+    cells = np.floor((high - low) / cell).astype(np.int64) + 1
+    starts, items = _grid(gum, low, cell, cells)
+    segments, owner = _cut(crown, gum, low, cell, cells, starts, items)
     long = np.linalg.norm(segments[:, 1] - segments[:, 0], axis=1) > _SHORTEST_MM
     segments, corners = segments[long], crown[owner[long]]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -44,10 +45,6 @@ def crown_gum_segments(
 
 def _touching(triangles: Array, low: Array, high: Array) -> Mask:
     return (triangles.min(1) <= high).all(1) & (triangles.max(1) >= low).all(1)
-
-
-def _cells(low: Array, high: Array, cell: float) -> NDArray[np.int64]:
-    return np.floor((high - low) / cell).astype(np.int64) + 1
 
 
 @numba.njit(nogil=True, cache=True)

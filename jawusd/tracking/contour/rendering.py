@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from jawusd.base.arrays import Array
 from jawusd.media.working_view import warp_nearest
 from jawusd.tracking.config import Mapper
-from jawusd.tracking.contour.samples import COLUMNS, INVERSE_DEPTH, NX, NY, U, V, X, Y, Z, contour_samples
+from jawusd.tracking.contour.samples import COLUMNS, INVERSE_DEPTH, NX, NY, U, V, X, Y, Z, contour_samples, pixel
 from jawusd.tracking.contour.scan import ARCHES, Scan
 from jawusd.tracking.contour.views import View
 
@@ -131,11 +131,8 @@ class Drawings:
     ) -> Drawing:
         """Return a drawing that can be warped to a pose of an arch; thread-safe for different arches or views.
 
-        Args:
-            arch, view: 0 upper, 1 lower; index of the view.
-            camera: camera centre in world coordinates [mm], shape (3,).
-            T_world_scan: the pose, shape (4, 4).
-            matrix, shape: as for `Drawing`.
+        `camera` is the camera centre in the world (3,) [mm], `T_world_scan` the pose (4, 4); others are as for
+        `Drawing`.
         """
         eye = T_world_scan[:3, :3].T @ (camera - T_world_scan[:3, 3])
         key = (arch, view, camera.tobytes())
@@ -158,16 +155,11 @@ class Drawings:
 def _moved(
     samples: Array, silhouettes: int, matrix: Array, cos: float, sin: float, height: int, width: int, out: Array
 ) -> tuple[int, int]:
-    """Move samples to another pose and write those that lie in the window, silhouettes first.
-
-    Return the number of samples written, and the number of silhouette samples among them.
-    """
+    """Move samples to another pose, and write those in the window; return their number and that of silhouettes."""
     n, first = 0, 0
     for s in range(len(samples)):
         x, y, z = samples[s, X], samples[s, Y], samples[s, Z]
-        w = matrix[2, 0] * x + matrix[2, 1] * y + matrix[2, 2] * z + matrix[2, 3]
-        u = (matrix[0, 0] * x + matrix[0, 1] * y + matrix[0, 2] * z + matrix[0, 3]) / w
-        v = (matrix[1, 0] * x + matrix[1, 1] * y + matrix[1, 2] * z + matrix[1, 3]) / w
+        u, v, w = pixel(matrix, x, y, z)
         if u < 0.5 or v < 0.5 or u > width - 1.5 or v > height - 1.5:
             continue
         for k in range(COLUMNS):
@@ -233,13 +225,9 @@ class Rendering:
 
     def update(self, poses: Array) -> None:
         """Render the scans again whose projections have moved by more than the allowed distance."""
-
-        def show(task: tuple[int, int]) -> None:
-            self._show(*task, poses[task[0]])
-
         self._drawings.forget_old()
         tasks = [(r, c) for r in ARCHES for c in range(len(self._views)) if self._moved(r, c, poses[r])]
-        list(self._map(show, tasks))
+        list(self._map(lambda task: self._show(*task, poses[task[0]]), tasks))
 
     def samples(self, contour: Contour, r: int, c: int, pose: Array) -> tuple[Array, int]:
         """Return a copy of a contour's samples in a view, warped to a pose (4, 4) at the view's exposure."""

@@ -107,7 +107,8 @@ def _in_picture(matrix: Array, direction: Array) -> Array:
 
 
 @numba.njit(nogil=True, cache=True, inline="always")
-def _pixel(matrix: Array, x: float, y: float, z: float) -> tuple[float, float, float]:
+def pixel(matrix: Array, x: float, y: float, z: float) -> tuple[float, float, float]:
+    """Return the pixel (u, v) and the depth [mm] of a point under a projection (3, 4)."""
     w = matrix[2, 0] * x + matrix[2, 1] * y + matrix[2, 2] * z + matrix[2, 3]
     u = (matrix[0, 0] * x + matrix[0, 1] * y + matrix[0, 2] * z + matrix[0, 3]) / w
     v = (matrix[1, 0] * x + matrix[1, 1] * y + matrix[1, 2] * z + matrix[1, 3]) / w
@@ -137,8 +138,8 @@ def _silhouette(
             continue
         if g >= 0 and not front[f]:
             f = g
-        ui, vi, wi = _pixel(matrix, vertices[i, 0], vertices[i, 1], vertices[i, 2])
-        uj, vj, wj = _pixel(matrix, vertices[j, 0], vertices[j, 1], vertices[j, 2])
+        ui, vi, wi = pixel(matrix, vertices[i, 0], vertices[i, 1], vertices[i, 2])
+        uj, vj, wj = pixel(matrix, vertices[j, 0], vertices[j, 1], vertices[j, 2])
         if wi <= 0 or wj <= 0:
             continue
         if max(ui, uj) < 0 or max(vi, vj) < 0 or min(ui, uj) >= shape[1] or min(vi, vj) >= shape[0]:
@@ -153,7 +154,7 @@ def _silhouette(
             k = faces[f, 1]
         if k in (i, j):
             k = faces[f, 2]
-        uk, vk, wk = _pixel(matrix, vertices[k, 0], vertices[k, 1], vertices[k, 2])
+        uk, vk, wk = pixel(matrix, vertices[k, 0], vertices[k, 1], vertices[k, 2])
         if nx * (uk - ui) + ny * (vk - vi) > 0:  # make the normal point away from the third corner of the face
             nx = -nx
             ny = -ny
@@ -167,7 +168,7 @@ def _silhouette(
             sample = out[n]
             for a in range(3):
                 sample[a] = vertices[i, a] + t * (vertices[j, a] - vertices[i, a])
-            sample[U], sample[V], w = _pixel(matrix, sample[X], sample[Y], sample[Z])
+            sample[U], sample[V], w = pixel(matrix, sample[X], sample[Y], sample[Z])
             sample[NX], sample[NY] = nx, ny
             sample[LENGTH] = length / pieces
             sample[INVERSE_DEPTH] = 1.0 / w
@@ -334,11 +335,11 @@ def _gingival_margin(
         p = segments[s, 0]
         q = segments[s, 1]
         x, y, z = 0.5 * (p[0] + q[0]), 0.5 * (p[1] + q[1]), 0.5 * (p[2] + q[2])
-        u, v, w = _pixel(matrix, x, y, z)
+        u, v, w = pixel(matrix, x, y, z)
         if w <= 0 or u < 3 or v < 3 or u > width - 4 or v > height - 4:
             continue
-        up, vp, wp = _pixel(matrix, p[0], p[1], p[2])
-        uq, vq, wq = _pixel(matrix, q[0], q[1], q[2])
+        up, vp, wp = pixel(matrix, p[0], p[1], p[2])
+        uq, vq, wq = pixel(matrix, q[0], q[1], q[2])
         length = np.sqrt((uq - up) ** 2 + (vq - vp) ** 2)
         if length < 0.05:  # image length [px] below which a segment is viewed end-on, so its direction is undefined
             continue

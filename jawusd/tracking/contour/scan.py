@@ -186,10 +186,7 @@ def _wound_outwards(vertices: Array, faces: Faces) -> Faces:
 
 
 def _edge_table(faces: Faces) -> Faces:
-    """Return two vertices, face, and other face (-1 at a border) of every edge, shape (E, 4).
-
-    If more than two faces share an edge, further pairs of faces form separate edges.
-    """
+    """Return two vertices, face, and other face (-1 at a border) of every edge, one per pair of faces, shape (E, 4)."""
     pairs = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
     owner = np.repeat(np.arange(len(faces), dtype=np.int32), 3)
     order = np.lexsort((owner, pairs[:, 1], pairs[:, 0]))

@@ -15,7 +15,7 @@ import numpy as np
 from jawusd.base.arrays import Array, Mask
 from jawusd.geometry import bite_normal, orthonormalise, transform_point
 from jawusd.tracking.config import Item, Mapper, Result, TrackingConfig
-from jawusd.tracking.contour.correspondences import accumulate_outline, scatter_of_tiles, search_edges
+from jawusd.tracking.contour.correspondences import accumulate, scatter_of_tiles, search_edges
 from jawusd.tracking.contour.equations import (
     NormalEquations,
     OutlineSums,
@@ -111,30 +111,15 @@ class ContourSolver:
             rendering: rendering of these views by this solver, shared with other alignments.
         """
         use = present_masks(views) if use is None else use
-        if self.thin is None or not gates_px:
-            return self._descend(poses, poses, views, gates_px, use, terms, outline_weight, rendering)
-        rough = self.thin.solve(poses, views, gates_px, use, terms, outline_weight)
-        gates = tuple(gates_px[-1:]) * _DENSE_STEPS
-        last = self._descend(poses, rough.poses, views, gates, use, terms, outline_weight, rendering)
-        return replace(last, iterations=rough.iterations + last.iterations)
-
-    def _descend(
-        self,
-        start: Array,
-        poses: Array,
-        views: Sequence[View],
-        gates_px: Sequence[float],
-        use: Mask,
-        terms: Sequence[ResidualTerm],
-        outline_weight: Array | None,
-        rendering: Rendering | None,
-    ) -> Solution:
-        """Take one step per gate from the given poses."""
+        start, earlier, left = poses, 0, tuple(gates_px)
+        if self.thin is not None and left:
+            rough = self.thin.solve(poses, views, gates_px, use, terms, outline_weight)
+            poses, earlier, left = rough.poses, rough.iterations, left[-1:] * _DENSE_STEPS
         poses = np.array(poses, np.float64)
         rendering = rendering or self.rendering(views)
         pull = StartTerm(start, self._start_strength)
         all_terms: tuple[ResidualTerm, ...] = (OutlineTerm(False), OutlineTerm(True), pull, *terms)
-        iterations, left = 0, tuple(gates_px)
+        iterations = 0
         while left:
             iterations += 1
             state = self.linearise(poses, views, use, left[0], rendering)
@@ -149,7 +134,7 @@ class ContourSolver:
             poses = orthonormalise(poses)
         gate = gates_px[-1] if gates_px else self.config.final_gate_px[1]
         state = self.linearise(poses, views, use, gate, rendering, final=True)
-        return replace(state, iterations=iterations)
+        return replace(state, iterations=earlier + iterations)
 
     def linearise(
         self,
@@ -195,7 +180,8 @@ class ContourSolver:
                 matched.append(Matched(r, c, samples, distances, used[r]))
             where = (moved[r, c], views[c].matrix, centres[r])
             limits = (used[r], config.score_gate_px, pull)
-            accumulate_outline(r, c, samples, count, distances, limits, where, silhouette, margin)
+            accumulate(samples[:count], distances[:count], limits, where, silhouette, r, c)
+            accumulate(samples[count:], distances[count:], limits, where, margin, r, c)
             if final:
                 shape = views[c].masks.shape[1:]
                 own, gum = scatter_of_tiles(samples, distances, used[r], *where, shape, config.tile_px)

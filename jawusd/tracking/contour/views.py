@@ -79,12 +79,7 @@ class View:
 
 
 class MaskViews:
-    """Reads the masks of all cameras by frame number of the reference camera; a context manager.
-
-    Attributes:
-        cameras: the cameras with masks that are not all black, in capture order.
-        frames: first frame in which any camera may have a mask, and one past the last.
-    """
+    """Reads the masks of all cameras by frame number of the reference camera; a context manager."""
 
     def __init__(
         self,
@@ -109,7 +104,7 @@ class MaskViews:
         self._masked = masked = masked_sources(sources, cameras, offsets, fewest)
         self._files = [s for s in sources if isinstance(s, CameraSource)]
         self._sizes = {s.name: cameras[s.name].size_px for s in self._files if s.masks}
-        self.cameras = tuple(cameras[s.name] for s in masked)
+        self.cameras = tuple(cameras[s.name] for s in masked)  # those with masks that are not all black, in order
         self._offsets = [offsets[s.name] for s in masked]
         self._working, self._readers = [], []
         for source, camera in zip(masked, self.cameras, strict=True):
@@ -117,7 +112,7 @@ class MaskViews:
             self._working.append(working)
             readers = open_masks(source, camera.size_px, prepare=working.mask)
             self._readers.append([self._stack.enter_context(reader) for reader in readers])
-        self.frames = masked_frames(self._offsets, self._readers)
+        self.frames = masked_frames(self._offsets, self._readers)  # end exclusive
 
     def __enter__(self) -> MaskViews:
         return self

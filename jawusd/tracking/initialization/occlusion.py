@@ -156,10 +156,7 @@ def _side_gap(signed: Sequence[Array], surfaces: Sequence[CrownSurface], aside: 
 
 
 def _compare_widths(upper: Array, lower: Array) -> tuple[float, float]:
-    """Return the lateral distance between the midlines [mm], and the ratio of the arch widths; NaN if unknown.
-
-    They are measured in transverse slabs in which both arches have teeth on both sides.
-    """
+    """Return the lateral distance between the midlines [mm], and the ratio of the arch widths; NaN if unknown."""
     middle = 0.5 * (upper[:, 0].mean() + lower[:, 0].mean())
     apart, ratios = [], []
     for z in np.arange(max(upper[:, 2].min(), lower[:, 2].min()), min(upper[:, 2].max(), lower[:, 2].max()), _SLAB_MM):
@@ -178,10 +175,7 @@ def _compare_widths(upper: Array, lower: Array) -> tuple[float, float]:
 
 
 def _forward(flat: Array) -> Array:
-    """Return the forward direction, towards the closed end, of a horseshoe of points (N, 2), shape (2,).
-
-    It is the axis along which both legs diverge symmetrically.
-    """
+    """Return the forward direction, towards the closed end, of a horseshoe of points (N, 2), shape (2,)."""
     flat = flat[:: max(1, len(flat) // 2000)]
     best, found = -np.inf, np.array([0.0, 1.0])
     for angle in np.deg2rad(np.arange(0, 360, 5)):

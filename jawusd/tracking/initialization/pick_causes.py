@@ -58,7 +58,14 @@ def possible_mistakes(given: Setting) -> Iterator[Mistake]:
         "Export them again without mirroring; one axis may have been negated.",
         _with_scans(given, np.array([-1.0, 1.0, 1.0])),
     )
-    yield from _exchanged_scans(given)
+    vertices = given.vertices[::-1]
+    if all(pick.vertex < len(own) for own, picks in zip(vertices, given.picks, strict=True) for pick in picks):
+        yield Mistake(
+            "scans_exchanged",
+            "upper_teeth and lower_teeth in [scans] are exchanged",
+            "Exchange the names of these files.",
+            replace(given, vertices=vertices, crowns=given.crowns[::-1]),
+        )
     yield from _exchanges(given)
     size, _ = picked_size(given.picks, given.vertices, given.cameras)
     if abs(size - 1.0) > _SIZE_SHARE:
@@ -71,18 +78,6 @@ def possible_mistakes(given: Setting) -> Iterator[Mistake]:
             True,
         )
     yield from _wrong_lenses(given)
-
-
-def _exchanged_scans(given: Setting) -> Iterator[Mistake]:
-    """Yield the swap of the two scans, if all picked vertices also exist in the swapped scans."""
-    vertices = given.vertices[::-1]
-    if all(pick.vertex < len(own) for own, picks in zip(vertices, given.picks, strict=True) for pick in picks):
-        yield Mistake(
-            "scans_exchanged",
-            "upper_teeth and lower_teeth in [scans] are exchanged",
-            "Exchange the names of these files.",
-            replace(given, vertices=vertices, crowns=given.crowns[::-1]),
-        )
 
 
 def _exchanges(given: Setting) -> Iterator[Mistake]:
@@ -212,10 +207,7 @@ def fitted_camera(
 
 
 def _sights(picks: Sequence[Pick], vertices: Array) -> tuple[Array, Array, list[tuple[str, list[int], Array]]]:
-    """Return the picked points of a scan relative to their mean (P, 3), the mean (3,), and the pixels of each camera.
-
-    For each camera, the indices of its points are followed by their pixels (N, 2).
-    """
+    """Return the picked points relative to their mean (P, 3), the mean (3,), and indices and pixels by camera."""
     points = np.stack([vertices[pick.vertex] for pick in picks])
     middle = points.mean(axis=0)
     seen: dict[str, list[tuple[int, list[float]]]] = {}

@@ -110,10 +110,7 @@ class _Evidence:
 
 
 def _evidence(setting: Setting, seen: Sequence[Seen], masked: Sequence[str]) -> _Evidence:
-    """Estimate poses from the picks, and measure how well the masks agree; raises TrackingError if the picks do not.
-
-    For each camera, the best candidate time offset of `seen` is used.
-    """
+    """Estimate poses from the picks, and measure how well the masks agree; raises TrackingError if the picks do not."""
     poses, wrong, misses = [], {}, []
     for picks, vertices, name in zip(setting.picks, setting.vertices, ARCH_NAMES, strict=True):
         pose, wrong[name] = pose_from_picks(picks, vertices, setting.cameras, name)
@@ -150,10 +147,7 @@ def _covered(setting: Setting, poses: Sequence[Array], seen: Sequence[Seen], mas
 def _explanation(
     given: Setting, found: _Evidence | None, seen: Sequence[Seen], masked: Sequence[str]
 ) -> tuple[Mistake, _Evidence] | None:
-    """Return the mistake that best explains the misfit, and the evidence after correcting it; otherwise None.
-
-    `found` is the evidence for the inputs as given; None if the picks contradict one another.
-    """
+    """Return the mistake that best explains the misfit, with the evidence once it is corrected, or None."""
     allowed = 0 if found is None else found.rejected
     tried: list[tuple[Mistake, _Evidence]] = []
     for mistake in islice(possible_mistakes(given), _MOST_TRIED):

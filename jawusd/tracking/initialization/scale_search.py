@@ -95,10 +95,7 @@ class _Sizes:
         return Footage(sources, cameras, self._offsets, self._capture.frames)
 
     def climb(self, frame: int, size: float, poses: Array) -> tuple[float, float]:
-        """Return the size with the best fit, found by hill climbing from given poses, and the fit of the worse arch.
-
-        The fit is -inf if the climb has not ended after `_MOST_SIZES` evaluations.
-        """
+        """Return the size with the best fit, by hill climbing, and the fit of the worse arch, -inf without an end."""
         objective, fit, poses = self._fitted(frame, size, poses, size)
         left = _MOST_SIZES
         beside = {}

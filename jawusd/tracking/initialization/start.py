@@ -259,10 +259,7 @@ def _picks_off(search: StartSearch, start: Start, poses: Array, sigma_mm: Mappin
 def _elsewhere(
     search: StartSearch, footage: Footage, start: Start, reason: str = "the picks do not fit the masks of their frame"
 ) -> Start:
-    """Return a start on another frame that fits, since lips may hide the teeth on the picked frame.
-
-    Without such a frame, return the start unchanged; it then fails with its own error.
-    """
+    """Return a start on another frame that fits; without one, the given start, which then fails with its own error."""
     other = _near_on_another_frame(search, footage, start)
     if other is None:
         try:

@@ -148,10 +148,7 @@ class Attempts:
         return trial
 
     def _spare(self, trial: Trial, arch: int) -> bool:
-        """Return whether head and jaw remain well known without one of the masks of an arch.
-
-        One of two masks suffices if both cameras show the other arch, and earlier frames determine the expected pose.
-        """
+        """Return whether an arch has a mask to spare: one of two does if the other arch and the past are known."""
         own, other = trial.use[arch].sum(), trial.use[1 - arch].sum()
         return bool(own > FEWEST_MASKS or (own == FEWEST_MASKS <= other and self._residuals))
 

@@ -88,7 +88,8 @@ def tracks_of(performance: Performance, jaw: JawRig) -> Tracks:
     of_lower[..., JAW] = se3_adjoint(head) @ by_d
     relative_covariance = _spread(by_d, p.covariance[:, JAW, JAW]) + p.rig_pose_covariance
     meta = TracksMeta(solver="performance", tolerance_mm=jaw.tolerance_mm)
-    meta.update(_known_notes(p))
+    kinds = {"start": dict, "findings": list, "fps": float, "focal": dict}
+    meta.update(cast(TracksMeta, {key: p.notes[key] for key in kinds if isinstance(p.notes.get(key), kinds[key])}))
     moved = jaw.meta.get("registration")
     if isinstance(moved, dict) and moved.get("applied"):  # the lower scan is registered as in the rig
         meta["registration"] = cast(Registration, moved)
@@ -124,17 +125,3 @@ def tracks_of(performance: Performance, jaw: JawRig) -> Tracks:
 
 def _spread(slope: Array, covariance: Array) -> Array:
     return np.asarray(slope @ covariance @ np.swapaxes(slope, -1, -2), np.float64)
-
-
-def _known_notes(p: Performance) -> TracksMeta:
-    out = TracksMeta()
-    start, findings, focal = p.notes.get("start"), p.notes.get("findings"), p.notes.get("focal")
-    if isinstance(start, dict):
-        out["start"] = start
-    if isinstance(findings, list):
-        out["findings"] = findings
-    if isinstance(p.notes.get("fps"), float):
-        out["fps"] = cast(float, p.notes["fps"])
-    if isinstance(focal, dict):
-        out["focal"] = focal
-    return out

@@ -122,7 +122,7 @@ class _Take:
         return arch_fit(self._scans, found.solution, views, self._config.uncovered_price)
 
     def _walk(self, way: range, near: FrameFit) -> Iterator[FrameFit]:
-        """Yield the fits of frames in tracking order, starting next to a given fit.
+        """Yield the fits of frames in tracking order, next to a given fit.
 
         If frames are aligned again, their residuals are compared with those of all frames aligned so far.
         """
@@ -188,34 +188,24 @@ def solve_capture(
     scans = (prepare_scan(upper, "upper"), prepare_scan(lower, "lower"))
     solver = ContourSolver(scans, config)
     with ThreadPoolExecutor(threads) as pool:
-        start = _begin(capture, table, offsets, (upper, lower), solver, jaw, pool.map)
-    centre = teeth_centre(scans, Coordinates(jaw, scans).arches(start.pose))
+        frame, pose, notes, findings = _begin(capture, table, offsets, (upper, lower), solver, jaw, pool.map)
+    centre = teeth_centre(scans, Coordinates(jaw, scans).arches(pose))
     with MaskViews(capture.cameras, table, offsets, centre, config.working_px_per_mm, 1) as masks:
         shot = Shot(
             views=masks,
             camera_names=tuple(camera.name for camera in masks.cameras),
             frames=capture.frames or masks.frames,
-            start_frame=start.frame,
-            start=start.pose,
+            start_frame=frame,
+            start=pose,
             fps=capture.fps,
             fixed_head=fixed_head,
             free_focal=free_focal,
             skin=skin,
         )
         found = solve_performance(jaw, scans, shot, config, progress=progress)
-        found.notes["findings"] = [finding.as_json() for finding in (*start.findings, *masks.findings())]
-    found.notes["start"] = start.notes
+        found.notes["findings"] = [finding.as_json() for finding in (*findings, *masks.findings())]
+    found.notes["start"] = notes
     return found
-
-
-@dataclass(frozen=True, eq=False)
-class _Begin:
-    """Start of a solve: frame and pose, how both were found, and findings."""
-
-    frame: int
-    pose: Pose
-    notes: dict[str, object]
-    findings: tuple[Finding, ...]
 
 
 def _begin(
@@ -226,18 +216,18 @@ def _begin(
     solver: ContourSolver,
     jaw: JawRig,
     map_: Mapper,
-) -> _Begin:
-    """Return a start from picks or by a search; with a single camera, the search uses the rig."""
+) -> tuple[int, Pose, dict[str, object], Sequence[Finding]]:
+    """Return start frame and pose, how both were found, and findings; with a single camera, search with the rig."""
     sources = masked_sources(capture.cameras, cameras, offsets, 1)
     if len(sources) > 1:
         start = find_start(capture, cameras, offsets, meshes, solver, map_)
         pose = Coordinates(jaw, solver.scans).pose_of(start.poses)
-        return _Begin(start.frame, pose, start.notes, start.findings)
+        return start.frame, pose, start.notes, start.findings
     T_anatomical_scan, findings = check_occlusion(solver.scans, capture.anatomy.T_anatomical_skull)
     footage = Footage(sources, cameras, offsets, capture.frames, 1)
     found = SingleStart(meshes, solver, jaw, T_anatomical_scan, map_).find(footage)
     notes: dict[str, object] = {"by": "search with the rig", "frame": found.frame, "fit": found.fit}
-    return _Begin(found.frame, found.pose, notes, tuple(findings))
+    return found.frame, found.pose, notes, findings
 
 
 def solve_by_skin(jaw: JawRig, scans: Sequence[Scan], skin: SkinOf, frames: range, fps: float) -> Performance:

@@ -148,11 +148,7 @@ class SingleStart:
         return best
 
     def _searched(self, views: Sequence[View], places: Array) -> list[Pose]:
-        """Return the most promising head poses, each with the most promising jaw pose for it.
-
-        The upper arch alone hardly constrains the distance, so head poses are ranked after a few alignment steps with
-        both arches.
-        """
+        """Return the most promising head poses, ranked with both arches, each with its most promising jaw pose."""
         instant, few = self._rough.instant(views), self._rough.config.trial_gates_px
         tried: list[tuple[float, Pose]] = []
         for pair in places:

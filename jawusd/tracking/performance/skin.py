@@ -30,16 +30,12 @@ _SHARE, _SLOW_S, _FAST_S = 0.7, 1.0, 0.04
 
 
 class SkinFactor:
-    """Normal equations of the measurements of d from skin.
-
-    Attributes:
-        used: frames with a factor, shape (F,): those in which the face is known.
-        familiar: those used frames in which the face resembles the training frames, shape (F,).
-    """
+    """Normal equations of the measurements of d from skin."""
 
     def __init__(self, skin: SkinJaw, fps: float, wider: float = 1.0) -> None:
         """Prepare with d of every frame; `wider` multiplies all precisions, as covariances are multiplied later."""
-        self.used: Mask = np.asarray(np.isfinite(skin.d).all(axis=-1))
+        self.used: Mask = np.asarray(np.isfinite(skin.d).all(axis=-1))  # frames in which the face is known, shape (F,)
+        #: those of them in which the face resembles the training frames, shape (F,)
         self.familiar: Mask = np.asarray(self.used & skin.familiar)
         self._d, self._wider = skin.d, wider
         covariance = np.where(self.used[:, None, None], skin.covariance, np.eye(3))
@@ -57,8 +53,7 @@ class SkinFactor:
     def add(self, system: TakeSystem, d: Array, slow: Array, first: int) -> None:
         """Add the factor to the equations of a take, in which the slow error is the last unknowns of each frame.
 
-        `d` [mm] and `slow`, shape (F, 3), are the current estimates; `first` is the index of d in the unknowns of a
-        frame.
+        `d` [mm] and `slow`, shape (F, 3), are current estimates; `first` is the index of d in the unknowns of a frame.
         """
         size = system.local + system.shared
         last = system.local - SLOW

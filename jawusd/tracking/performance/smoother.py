@@ -225,10 +225,7 @@ class Smoother:
         return fits
 
     def _covariance(self, system: TakeSystem) -> tuple[Array, Array]:
-        """Return the covariances of each frame's unknowns, shape (F, 9, 9), and the covariance of the take's unknowns.
-
-        The covariances of the frames include the uncertainty of the take's unknowns.
-        """
+        """Return the covariances of each frame's unknowns, shape (F, 9, 9), and of the take's unknowns."""
         found, unknowns = system.covariance(), self._unknowns
         size = unknowns.local
         found = found._replace(own=found.own[:, :size, :size], response=found.response[:, :size])

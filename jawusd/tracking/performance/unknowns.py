@@ -36,14 +36,7 @@ class TakeState:
 
 
 class Unknowns:
-    """Layout of the unknowns of frames and take, and normal equations in these unknowns.
-
-    Attributes:
-        local: number of unknowns per frame.
-        shared: number of unknowns of the take.
-        jaw: slice of the jaw parameters in the unknowns of a frame.
-        head: slice of the head pose in the unknowns of a frame; None if the head is fixed.
-    """
+    """Layout of the unknowns of frames and take, and normal equations in these unknowns."""
 
     def __init__(
         self,
@@ -60,14 +53,14 @@ class Unknowns:
         self.free_focal = cameras if free_focal else 0
         sigma = annotator.sigma(cameras)
         self._layers, self._sigma = bias_layers(cameras)[..., sigma > 0], sigma[sigma > 0]
-        self.local = LOCAL - 6 if fixed_head else LOCAL
-        self.jaw = slice(self.local - 3, self.local)
-        self.head = None if fixed_head else HEAD
+        self.local = LOCAL - 6 if fixed_head else LOCAL  # number of unknowns per frame
+        self.jaw = slice(self.local - 3, self.local)  # the jaw parameters in the unknowns of a frame
+        self.head = None if fixed_head else HEAD  # the head pose in the unknowns of a frame
         first = 6 if fixed_head else 0
         self._habits = slice(first, first + len(self._sigma))
         self.focal = slice(self._habits.stop, self._habits.stop + self.free_focal)
-        self.shared = self.focal.stop
-        # Factor by which the number of frames overstates the information about bias, since frames are not independent.
+        self.shared = self.focal.stop  # number of unknowns of the take
+        #: factor by which the number of frames overstates the information, since frames are not independent
         self.redundancy = np.ones(self.shared)
         self.redundancy[self._habits] = annotator.redundancy(frames)
 

@@ -262,10 +262,7 @@ def observe_bite(
     extrinsics: Extrinsics,
     variance_px3: Array,
 ) -> None:
-    """Add the observation that the teeth are closed to a take; outline biases that separate the teeth become unlikely.
-
-    `variance_px3` is as for `TakeEquations`.
-    """
+    """Add the observation that the teeth are closed: outline biases that separate the teeth become unlikely."""
     used = [f for f in rest.frames if f in records and records[f].found.all()]
     if len(used) < _FEWEST_FRAMES:
         return

@@ -28,9 +28,7 @@ def delay_motions(records: Mapping[int, FrameRecord], frame: int, delays: Array)
 def _motion_twists(records: Mapping[int, FrameRecord], frame: int, arch: int) -> tuple[Array, Array] | None:
     """Fit a parabola in time; return the twist per frame about the arch's centre and its change per frame, shapes (6,).
 
-    It passes through both neighbouring frames, or through two frames on one side: more frames would smooth too much,
-    since a jaw starts and stops within one or two frames. Across a gap, uniform motion is assumed; None if it is too
-    wide.
+    More frames would smooth too much, since a jaw starts and stops within one or two frames.
     """
 
     def step(frames: int) -> Array:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -85,11 +86,14 @@ class FrameTracker:
         instant = _Instant(starts, views, pose_history or ())
         self.searched = False
         trial = first = self._begin(starts[0], views, gates)
+        # arches that fit worse than in recent frames, and worse than closing lips can explain
+        suspect = partial(self._failing, share=self._config.suspect_score)
+        alarming = partial(self._failing, share=self._config.alarming_score)
         for failing, attempt in (
-            (self._suspect, self._try_other_starts),
+            (suspect, self._try_other_starts),
             (self._uneven, self._drop_conflicting_masks),
-            (self._suspect, self._try_wide_gates),
-            (self._alarming, self._search_many_starts),
+            (suspect, self._try_wide_gates),
+            (alarming, self._search_many_starts),
         ):
             bad = failing(trial)
             if bad.any() and (attempt != self._search_many_starts or pose_history is not None):
@@ -127,22 +131,16 @@ class FrameTracker:
         solution = solver.solve(start, views, gates, use)
         return _Trial(solution, *uncovered_px(solver.scans, solution.poses, views, solver.map), use)
 
-    def _suspect(self, trial: _Trial) -> Mask:
-        """Return which arches fit worse than in recent frames, shape (2,)."""
-        return self._failing(trial, self._config.suspect_score)
-
-    def _alarming(self, trial: _Trial) -> Mask:
-        """Return which arches fit worse than closing lips can explain, shape (2,)."""
-        return self._failing(trial, self._config.alarming_score)
-
     def _failing(self, trial: _Trial, share: float) -> Mask:
+        """Return which arches have a fraction of the usual score, rough residuals or uncovered masks, shape (2,)."""
         bad = self._low_score(trial, share) | self._high_residual(trial) | self._badly_covered(trial).any(1)
         return np.asarray(bad & trial.use.any(1))
 
     def _uneven(self, trial: _Trial) -> Mask:
-        """Return which arches are alarming (see `_alarming`), or fit one view far worse than usual, shape (2,)."""
+        """Return which arches are alarming, or fit one view far worse than usual, shape (2,)."""
         limit = self._config.uneven_residual * self.history.usual_residual()[:, None]
-        return self._alarming(trial) | (trial.use & (view_residual_px(trial.solution) > limit)).any(1)
+        uneven = (trial.use & (view_residual_px(trial.solution) > limit)).any(1)
+        return self._failing(trial, self._config.alarming_score) | uneven
 
     def _low_score(self, trial: _Trial, share: float) -> Mask:
         return np.asarray(score_px(trial.solution).sum(1) < share * self.history.usual_score().sum(1))

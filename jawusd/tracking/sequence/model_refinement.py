@@ -134,10 +134,7 @@ class _SecondPass:
 
 
 def _starts(tracks: Tracks, jaw: JawRig, measured: Mask) -> Array:
-    """Return start poses of every frame, T_world_upper and T_world_lower, shape (F, 2, 4, 4).
-
-    A lost arch is placed from the other one with interpolated jaw parameters, lost heads are interpolated linearly.
-    """
+    """Return start poses of every frame, T_world_upper and T_world_lower (F, 2, 4, 4), interpolated where lost."""
     frames = tracks.frames.astype(np.float64)
     d = jaw.interpolate(frames[measured], jaw.encode(tracks.raw_T_upper_lower[measured], inside=True)[0], frames)
     relative = jaw.pose(d)

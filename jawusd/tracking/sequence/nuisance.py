@@ -223,10 +223,7 @@ def interpolation_covariance(records: Mapping[int, FrameRecord], frame: int, arc
 def _reduced(
     solution: Solution, velocity: Array, arch: int, pivot: Array, layout: _Layout
 ) -> tuple[Array, Array, Array]:
-    """Return the normal equations of one frame with the pose eliminated, and the pose's response to the unknowns.
-
-    The response is the twist about the arch's centre per unit of the unknowns, shape (6, U).
-    """
+    """Return the equations of a frame without the pose, and the pose's twist per unit of the unknowns (6, U)."""
     outline, size = solution.outline, layout.size
     to_centre = se3_adjoint(translation(pivot - solution.centres[arch]))
     S, r, B = np.zeros((size, size)), np.zeros(size), np.zeros((6, size))

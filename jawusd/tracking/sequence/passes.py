@@ -73,10 +73,7 @@ class Passes:
         take.recover(partial(self._found_in, search, SearchBudget(len(take.frames))))
 
     def _found_in(self, search: LostSearch, budget: SearchBudget, lost: range, near: FrameRecord) -> Begin[FrameRecord]:
-        """Search for the teeth in a lost stretch, where they must fit as well as in other frames.
-
-        Raises TrackingError if the teeth were not found.
-        """
+        """Search for the teeth in a lost stretch; raises TrackingError if they do not fit as elsewhere."""
         for frame in search.frames(lost, self.records):
             if budget.allows(frame):
                 record = self._searched(search, lost, frame, near.solution.poses)

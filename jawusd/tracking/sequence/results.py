@@ -136,10 +136,7 @@ def _measured(
     correlation: float,
     rest: RestFrames,
 ) -> tuple[Array, Array, Array, ClosedBite | None]:
-    """Return poses (F, 2, 4, 4) and covariances (F, 2, 6, 6), covariances of relative poses (F, 6, 6), and closed bite.
-
-    `raw` are the poses as aligned, NaN where lost; `correlation` is the correlation length of outline errors [px].
-    """
+    """Return poses (F, 2, 4, 4), their covariances, those of relative poses (F, 6, 6), and the closed bite."""
     frames = np.array(sorted(records), np.int64)
     outline, habits = _covariances(records, correlation, nuisances, extrinsics)
     bite = closed_bite(frames, raw, outline, habits, rest)
@@ -212,10 +209,7 @@ def _of_tracked(records: Mapping[int, FrameRecord], figure: Callable[[Solution],
 def _covariances(
     records: Mapping[int, FrameRecord], correlation: float, nuisances: Nuisances, extrinsics: Extrinsics
 ) -> tuple[Array, Array]:
-    """Return the covariance of both arches' left twists, NaN where lost, in two parts of shape (F, 2, 6, 6).
-
-    The first part is caused by outline errors of each frame, the second by the nuisance parameters of the take.
-    """
+    """Return the covariances (F, 2, 6, 6) of left twists by outline errors of frames, and by nuisance parameters."""
     outline, habits = np.full((2, len(records), 2, 6, 6), np.nan)
     for k, frame in enumerate(sorted(records)):
         record = records[frame]

@@ -164,10 +164,7 @@ class _Take(Passes):
         return found, extrinsics
 
     def _late_cameras(self, equations: TakeEquations, extrinsics: Extrinsics, rest: RestFrames) -> Nuisances | None:
-        """Correct delays of about one frame in advance; return None if there are none.
-
-        A camera with such a delay also seems to have moved, and its masks seem to be wrong where the jaw is fast.
-        """
+        """Correct delays of about one frame in advance; return None if there are none."""
         c = self._config
         found = equations.solve(c, False)
         if np.abs(found.delays).max() < c.late_frames or not c.refine_rounds:

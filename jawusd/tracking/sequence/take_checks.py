@@ -65,34 +65,23 @@ def lens_findings(names: Sequence[str], found: Magnification, limits: LensLimits
     common = found.common
     sigma = float(np.sqrt(np.mean(found.sigma_scale**2) / len(found.scale)))  # motions of cameras are independent
     if abs(common) > max(limits.common, limits.clear * sigma) and (np.sign(found.scale) == np.sign(common)).all():
-        out.append(
-            Finding(
-                "scan_size",
-                "warning",
-                f"every camera shows the teeth {than(common)} than the scans: the scale of the scans or of the "
-                f"calibration is wrong; a difference of at most {limits.common:.1%} is usual.",
-                value=round(100 * common, 2),
-                limit=100 * limits.common,
-                hint=SIZE_HINT,
-            )
-        )
+        message = f"every camera shows the teeth {than(common)} than the scans: the scale of the scans or of the "
+        message += f"calibration is wrong; a difference of at most {limits.common:.1%} is usual."
+        out.append(_percent("scan_size", message, common, limits.common, SIZE_HINT))
     for c, name in enumerate(names):
         own, wide = float(found.scale[c] - common), _wide(name, c, found, limits)
         if len(names) >= _TELLING_CAMERAS and abs(own) > max(limits.scale, limits.clear * found.sigma_scale[c]):
-            out.append(
-                Finding(
-                    "focal_length",
-                    "warning",
-                    f"this camera shows the teeth {than(own)} than expected from its calibration and the others; "
-                    f"at most {limits.scale:.0%} is usual. Its focal length or its distance is wrong.",
-                    value=round(100 * own, 2),
-                    limit=100 * limits.scale,
-                    camera=name,
-                    hint="Calibrate this camera again with the lens, zoom and focus of the recording.",
-                )
-            )
+            message = f"this camera shows the teeth {than(own)} than expected from its calibration and the others; "
+            message += f"at most {limits.scale:.0%} is usual. Its focal length or its distance is wrong."
+            hint = "Calibrate this camera again with the lens, zoom and focus of the recording."
+            out.append(_percent("focal_length", message, own, limits.scale, hint, name))
         elif c == knocked:
-            out.append(_moved(name, float(found.turn_rad[c]), float(found.move_mm[c]), float(found.motion_clear[c])))
+            turn_deg = float(np.rad2deg(found.turn_rad[c]))
+            message = f"this camera seems to have turned, relative to the others, by {turn_deg:.2f} degrees and moved "
+            message += f"by {found.move_mm[c]:.1f} mm since its calibration, {found.motion_clear[c]:.0f} times the "
+            message += f"uncertainty; up to {OF_MASKS.knock:g} times is usual."
+            hint = "The camera was knocked, or its calibration is wrong: calibrate it again, or exclude it."
+            out.append(_camera_moved(name, turn_deg, message, hint))
         elif not wide and abs(found.bend[c]) > max(limits.bend, _CLEARLY * found.sigma_bend[c]):
             out.append(_bent(name, float(found.bend[c]), limits))
         out += wide
@@ -108,17 +97,9 @@ def _knocked(found: Magnification, limits: LensLimits) -> int | None:
     return worst if found.motion_clear[worst] > least else None
 
 
-def _moved(name: str, turn_rad: float, move_mm: float, clear: float) -> Finding:
-    """Return a warning about a camera that moved too far to be corrected."""
-    turn_deg = float(np.rad2deg(turn_rad))
-    return _camera_moved(
-        name,
-        turn_deg,
-        f"this camera seems to have turned, relative to the others, by {turn_deg:.2f} degrees and moved by "
-        f"{move_mm:.1f} mm since its calibration, {clear:.0f} times the uncertainty; "
-        f"up to {OF_MASKS.knock:g} times is usual.",
-        "The camera was knocked, or its calibration is wrong: calibrate it again, or exclude it.",
-    )
+def _percent(kind: str, message: str, value: float, limit: float, hint: str, camera: str | None = None) -> Finding:
+    """Return a warning about a fraction and its limit, both reported in percent."""
+    return Finding(kind, "warning", message, round(100 * value, 2), 100 * limit, camera=camera, hint=hint)
 
 
 def _camera_moved(name: str, turn_deg: float, message: str, hint: str) -> Finding:
@@ -128,26 +109,14 @@ def _camera_moved(name: str, turn_deg: float, message: str, hint: str) -> Findin
 def _bent(name: str, bend: float, limits: LensLimits) -> Finding:
     """Return a warning about a camera whose magnification changes with the distance from the optical axis."""
     if abs(bend) > _MOST_BEND:
-        return Finding(
-            "side_teeth",
-            "warning",
-            f"this camera's masks show the teeth {than(bend)} at 25 mm from the optical axis than in the centre; no "
-            f"lens distorts by more than {_MOST_BEND:.1%} there. The masks of the side teeth are wrong.",
-            value=round(100 * bend, 2),
-            limit=100 * _MOST_BEND,
-            camera=name,
-            hint="Check the masks at the corners of the mouth: they often end too early in the shadow, or include it.",
-        )
-    return Finding(
-        "lens_distortion",
-        "warning",
-        f"this camera shows the teeth {than(bend)} at 25 mm from the optical axis than its calibration predicts; "
-        f"at most {limits.bend:.1%} is usual. Its lens distortion is wrong.",
-        value=round(100 * bend, 2),
-        limit=100 * limits.bend,
-        camera=name,
-        hint="Check the signs and the order of the distortion coefficients, or calibrate the camera again.",
-    )
+        message = f"this camera's masks show the teeth {than(bend)} at 25 mm from the optical axis than in the centre; "
+        message += f"no lens distorts by more than {_MOST_BEND:.1%} there. The masks of the side teeth are wrong."
+        hint = "Check the masks at the corners of the mouth: they often end too early in the shadow, or include it."
+        return _percent("side_teeth", message, bend, _MOST_BEND, hint, name)
+    message = f"this camera shows the teeth {than(bend)} at 25 mm from the optical axis than its calibration predicts; "
+    message += f"at most {limits.bend:.1%} is usual. Its lens distortion is wrong."
+    hint = "Check the signs and the order of the distortion coefficients, or calibrate the camera again."
+    return _percent("lens_distortion", message, bend, limits.bend, hint, name)
 
 
 def _wide(name: str, c: int, found: Magnification, limits: LensLimits) -> list[Finding]:
@@ -156,18 +125,10 @@ def _wide(name: str, c: int, found: Magnification, limits: LensLimits) -> list[F
     bias, least = float(own.mean()), max(limits.bias_px, _CLEARLY * float(found.sigma_bias_px[c].max()))
     if len(found.bias_px) < _TELLING_CAMERAS or np.abs(own).min() < least or own.min() * own.max() < 0:
         return []
-    return [
-        Finding(
-            "masks_wide",
-            "warning",
-            f"the mask outlines lie {abs(bias):.1f} px {'outside' if bias > 0 else 'inside'} those of the other "
-            f"cameras at working resolution; at most {limits.bias_px} px is usual.",
-            value=round(bias, 2),
-            limit=limits.bias_px,
-            camera=name,
-            hint="Draw these masks again, or exclude this camera.",
-        )
-    ]
+    message = f"the mask outlines lie {abs(bias):.1f} px {'outside' if bias > 0 else 'inside'} those of the other "
+    message += f"cameras at working resolution; at most {limits.bias_px} px is usual."
+    hint = "Draw these masks again, or exclude this camera."
+    return [Finding("masks_wide", "warning", message, round(bias, 2), limits.bias_px, camera=name, hint=hint)]
 
 
 def motion_findings(names: Sequence[str], extrinsics: Extrinsics) -> list[Finding]:
@@ -196,18 +157,13 @@ def misfit_findings(records: Mapping[int, FrameRecord]) -> list[Finding]:
     for r, other in ((0, 1), (1, 0)):
         if share[r] < _FITS_LESS * share[other] and rough[r] > _FITS_ROUGHER * rough[other]:
             name = ARCH_NAMES[r]
+            message = f"the {name} scan barely fits its own masks: {share[r]:.0%} of its visible contour matches, with "
+            message += f"residuals of {rough[r]:.1f} px; for the {ARCH_NAMES[other]} scan, it is {share[other]:.0%}, "
+            message += f"with residuals of {rough[other]:.1f} px. The poses of the {name} scan are unreliable."
+            hint = f"Check that the {name} scan is a recent one of this subject, and that its masks show the {name} "
+            value, limit = 100 * float(share[r]), 100 * _FITS_LESS * float(share[other])
             out.append(
-                Finding(
-                    "scan_misfit",
-                    "warning",
-                    f"the {name} scan barely fits its own masks: {share[r]:.0%} of its visible contour matches, with "
-                    f"residuals of {rough[r]:.1f} px; for the {ARCH_NAMES[other]} scan, it is {share[other]:.0%}, "
-                    f"with residuals of {rough[other]:.1f} px. The poses of the {name} scan are unreliable.",
-                    value=round(100 * float(share[r]), 1),
-                    limit=round(100 * _FITS_LESS * float(share[other]), 1),
-                    hint=f"Check that the {name} scan is a recent one of this subject, and that its masks show the "
-                    f"{name} teeth.",
-                )
+                Finding("scan_misfit", "warning", message, round(value, 1), round(limit, 1), hint=hint + "teeth.")
             )
     return out
 
@@ -217,19 +173,11 @@ def search_findings(searches: SearchBudget, records: Mapping[int, FrameRecord]) 
     lost = [f for f in sorted(searches.left_out) if ((records[f].status == LOST) & records[f].used.any(1)).any()]
     if not lost:
         return []
-    return [
-        Finding(
-            "searches_left_out",
-            "warning",
-            f"{searches.fruitless} searches for lost teeth failed; for a take of this length, the limit is "
-            f"{searches.most} more failures than successes. Lost teeth were not searched for in {len(lost)} frames, "
-            "beginning with this one.",
-            value=len(lost),
-            limit=searches.most,
-            frame=lost[0],
-            hint="Check the masks of the lost frames: arches or cameras may be exchanged there.",
-        )
-    ]
+    message = f"{searches.fruitless} searches for lost teeth failed; for a take of this length, the limit is "
+    message += f"{searches.most} more failures than successes. Lost teeth were not searched for in {len(lost)} frames, "
+    message += "beginning with this one."
+    hint = "Check the masks of the lost frames: arches or cameras may be exchanged there."
+    return [Finding("searches_left_out", "warning", message, len(lost), searches.most, frame=lost[0], hint=hint)]
 
 
 _HALF = 0.5  # minimum fraction of a camera's masks that are used; with fewer, it mostly contradicts the others
@@ -245,29 +193,16 @@ def use_of_cameras(names: tuple[str, ...], records: Mapping[int, FrameRecord]) -
         seen, taken = present[..., c], used[..., c]
         with_masks, with_use = int(seen.any(1).sum()), int(taken.any(1).sum())
         if not with_masks:
-            out.append(
-                Finding(
-                    "camera_not_used",
-                    "warning",
-                    f"used in 0 of {len(frames)} frames: it has no masks from frame {frames[0]} to {frames[-1]}.",
-                    value=0,
-                    camera=name,
-                    hint="Check `frames`, the frame numbers of the camera's masks, and its time offset.",
-                )
-            )
+            message = f"used in 0 of {len(frames)} frames: it has no masks from frame {frames[0]} to {frames[-1]}."
+            hint = "Check `frames`, the frame numbers of the camera's masks, and its time offset."
+            out.append(Finding("camera_not_used", "warning", message, 0, camera=name, hint=hint))
         elif not with_use or taken.sum() < _HALF * seen.sum():
-            out.append(
-                Finding(
-                    "camera_rarely_used" if with_use else "camera_not_used",
-                    "warning",
-                    f"used in {with_use} of {len(frames)} frames: {int((seen & ~taken).sum())} of its "
-                    f"{int(seen.sum())} masks fit neither the scans nor the other cameras' masks.",
-                    value=round(float(taken.sum() / seen.sum()), 3),
-                    limit=_HALF,
-                    camera=name,
-                    hint="Check that the masks belong to this camera, and check its calibration and time offset.",
-                )
-            )
+            kind = "camera_rarely_used" if with_use else "camera_not_used"
+            message = f"used in {with_use} of {len(frames)} frames: {int((seen & ~taken).sum())} of its "
+            message += f"{int(seen.sum())} masks fit neither the scans nor the other cameras' masks."
+            hint = "Check that the masks belong to this camera, and check its calibration and time offset."
+            value = round(float(taken.sum() / seen.sum()), 3)
+            out.append(Finding(kind, "warning", message, value, _HALF, camera=name, hint=hint))
     return out
 
 

@@ -270,19 +270,14 @@ def time_findings(
 
 def _late(names: Sequence[str], frames: Mapping[int, float]) -> list[Finding]:
     """Return warnings about cameras that are late by some frames."""
-    return [
-        Finding(
-            "camera_late",
-            "warning",
-            f"the images of this camera are {abs(late):.1f} frames {'later' if late > 0 else 'earlier'} than its time "
-            f"offset implies; less than {_LATE_FRAMES} frames is usual.",
-            value=round(late, 2),
-            limit=_LATE_FRAMES,
-            camera=names[camera],
-            hint=f"Check this camera's offset in [sync]: {round(late):+d} frames would fit better.",
-        )
-        for camera, late in frames.items()
-    ]
+    out = []
+    for camera, late in frames.items():
+        message = f"the images of this camera are {abs(late):.1f} frames {'later' if late > 0 else 'earlier'} than its "
+        message += f"time offset implies; less than {_LATE_FRAMES} frames is usual."
+        hint = f"Check this camera's offset in [sync]: {round(late):+d} frames would fit better."
+        value = round(late, 2)
+        out.append(Finding("camera_late", "warning", message, value, _LATE_FRAMES, camera=names[camera], hint=hint))
+    return out
 
 
 def _step_of_delay(
@@ -302,14 +297,10 @@ def _step_of_delay(
 
 
 def _dropped(name: str, step: float, frame: int) -> Finding:
-    return Finding(
-        "frame_dropped",
-        "warning",
+    message = (
         f"the delay of this camera changes by {step:+.1f} frames near here: a frame was dropped or repeated; less "
-        f"than {_STEP_FRAMES} frames is usual.",
-        value=round(step, 2),
-        limit=_STEP_FRAMES,
-        camera=name,
-        frame=frame,
-        hint="Export the clip again at a constant frame rate, or split the take there.",
     )
+    message += f"than {_STEP_FRAMES} frames is usual."
+    hint = "Export the clip again at a constant frame rate, or split the take there."
+    value = round(step, 2)
+    return Finding("frame_dropped", "warning", message, value, _STEP_FRAMES, camera=name, frame=frame, hint=hint)
