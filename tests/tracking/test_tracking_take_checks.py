@@ -84,7 +84,7 @@ def test_mirrored_scans_are_named(capture):
 def lens_kinds(bend):
     """Return the findings if the first of three cameras magnifies side teeth."""
     bends, none, small = np.array([bend, 0.0, 0.0]), np.zeros(3), np.full(3, 1e-4)
-    return _lens_kinds(Magnification(none, small, bends, small, *_masks_and_motion(none), 0.5))
+    return _lens_kinds(Magnification(none, small, bends, small, *_masks_and_motion(none)))
 
 
 def _masks_and_motion(clear):
@@ -107,7 +107,7 @@ def _lens_kinds(found, limits=OF_MASKS):
 )
 def test_a_knocked_camera_is_named_and_its_lens_is_not(clear, named):
     small, bend = np.full(3, 1e-4), np.array([0.0, 0.007, 0.0])  # pictures of another position seem distorted
-    found = Magnification(np.zeros(3), small, bend, small, *_masks_and_motion(clear), 0.5)
+    found = Magnification(np.zeros(3), small, bend, small, *_masks_and_motion(clear))
     bent = [] if named == "cam1" else [("lens_distortion", "cam1")]
     assert sorted(_lens_kinds(found)) == sorted(bent + ([("camera_moved", named)] if named else []))
     assert _lens_kinds(found, OF_COLOURS) == []
@@ -124,7 +124,7 @@ def test_a_knocked_camera_is_named_and_its_lens_is_not(clear, named):
 )
 def test_masks_drawn_wider_in_one_camera_are_named(bias_px, bend, kinds):
     none, small, masks = np.zeros(3), np.full(3, 1e-4), _masks_and_motion(np.zeros(3))
-    found = Magnification(none, small, np.array([0.0, bend, 0.0]), small, np.array(bias_px), *masks[1:], 0.5)
+    found = Magnification(none, small, np.array([0.0, bend, 0.0]), small, np.array(bias_px), *masks[1:])
     assert _lens_kinds(found) == [(kind, "cam1") for kind in kinds]
 
 

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from jawusd.base.arrays import Array
+from jawusd.base.arrays import Array, Mask
 from jawusd.geometry import hat, mandible_metric, se3_adjoint, se3_inverse, transform_points
 from jawusd.meshes.raster import count_and_not, count_bits, pack_bits
 from jawusd.tracking.config import Mapper, TrackingConfig
@@ -148,6 +148,23 @@ def correlation_px(solution: Solution, config: TrackingConfig) -> Array:
             measured = np.trace(np.linalg.solve(H, solution.scatters[r])) / (6 * sigma[r] ** 2)
             out[r] = config.tile_factor * measured
     return out
+
+
+def outline_errors(solved: Iterable[tuple[Solution, Mask]], config: TrackingConfig) -> tuple[Array, float]:
+    """Return variance times correlation length of outline errors per arch [px^3], shape (2,), and that length [px].
+
+    Both are medians over frames, given as alignments and whether each arch was found, shape (2,).
+    """
+    figures = [np.where(found, [residual_px(own), correlation_px(own, config)], np.nan) for own, found in solved]
+    residual, lengths = np.reshape(figures, (-1, 2, 2)).swapaxes(0, 1)
+    known = lengths[np.isfinite(lengths)]
+    length = float(np.median(known)) if len(known) else config.correlation_px
+    if config.known_correlation_px is not None:
+        length = config.known_correlation_px
+    out = np.full(2, config.typical_noise_px3)
+    for r in np.flatnonzero(np.isfinite(residual).any(0)):
+        out[r] = np.nanmedian(residual[:, r]) ** 2 * length
+    return out, length
 
 
 def crown_sigma_mm(scan: Scan, solution: Solution, arch: int, config: TrackingConfig) -> float:

@@ -45,7 +45,6 @@ class Magnification:
     turn_rad: Array  # angle of rotation of each camera relative to the mean of all, shape (C,)
     move_mm: Array  # distance of translation of each camera relative to the mean of all, shape (C,)
     motion_clear: Array  # significance of both together, in standard deviations (Mahalanobis), shape (C,)
-    spread_px: float  # robust standard deviation of the residuals
 
     @property
     def common(self) -> float:
@@ -171,7 +170,7 @@ def _solved(blocks: Sequence[_Rows], cameras: int, config: TrackingConfig) -> Ma
     found = theta.reshape(cameras, _UNKNOWNS)
     bias_sigma = np.minimum(sigma[:, 8:], 1.0)
     motion = _motion(theta, covariance, cameras)
-    return Magnification(found[:, 0], sigma[:, 0], found[:, 1], sigma[:, 1], found[:, 8:], bias_sigma, *motion, spread)
+    return Magnification(found[:, 0], sigma[:, 0], found[:, 1], sigma[:, 1], found[:, 8:], bias_sigma, *motion)
 
 
 def _motion(theta: Array, covariance: Array, cameras: int) -> tuple[Array, Array, Array]:

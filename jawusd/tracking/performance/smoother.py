@@ -11,8 +11,7 @@ from jawusd.base.arrays import Array, Mask
 from jawusd.evaluator.skin import SkinJaw
 from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.contour.annotator import AnnotatorPrior, drawn_prior
-from jawusd.tracking.contour.quality import correlation_px, residual_px
-from jawusd.tracking.contour.scan import ARCHES
+from jawusd.tracking.contour.quality import outline_errors
 from jawusd.tracking.contour.solver import Matched
 from jawusd.tracking.performance.attempts import LARGEST_SIGMA, Attempts, FrameFit, usual_residual_px
 from jawusd.tracking.performance.coordinates import HEAD, JAW, LOCAL, Coordinates, Pose
@@ -262,13 +261,4 @@ def with_one_head(coordinates: Coordinates, fits: Sequence[FrameFit]) -> list[Fr
 
 def outline_variance(fits: Sequence[FrameFit], config: TrackingConfig) -> Array:
     """Return variance times correlation length of the outline errors of a take, per arch [px^3], shape (2,)."""
-    solutions = [(fit.solution, fit.found) for fit in fits if fit.solution is not None and fit.found.any()]
-    lengths = np.array([np.where(found, correlation_px(solution, config), np.nan) for solution, found in solutions])
-    known = lengths[np.isfinite(lengths)]
-    length = float(np.median(known)) if len(known) else config.correlation_px
-    out = np.full(2, config.typical_noise_px3)
-    for r in ARCHES:
-        values = [residual_px(solution)[r] for solution, found in solutions if found[r]]
-        if values:
-            out[r] = np.median(values) ** 2 * length
-    return out
+    return outline_errors(((fit.solution, fit.found) for fit in fits if fit.solution is not None), config)[0]

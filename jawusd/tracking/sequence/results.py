@@ -14,12 +14,12 @@ from jawusd.formats.notes import TracksMeta
 from jawusd.formats.tracks import LOST, Tracks
 from jawusd.geometry import se3_adjoint
 from jawusd.tracking.config import TrackingConfig
-from jawusd.tracking.contour.equations import Solution, translation
+from jawusd.tracking.contour.equations import translation
 from jawusd.tracking.contour.frame_record import FrameRecord
 from jawusd.tracking.contour.quality import (
-    correlation_px,
     landmark_sigmas,
     matched_px,
+    outline_errors,
     residual_px,
     twist_covariance,
 )
@@ -65,7 +65,7 @@ def assemble(
     frames = np.array(sorted(records), np.int64)
     raw, status, losses, centres, coverage, used, residual, matched = _columns(records, frames)
     raw[status == LOST] = np.nan
-    correlation = take_correlation_px(records, config)
+    _, correlation = outline_errors(((r.solution, r.found) for r in records.values()), config)
     raw, covariance, covariance_relative, bite = _measured(raw, records, nuisances, extrinsics, correlation, rest)
     if fuse is not None:
         raw, covariance, covariance_relative = fuse(raw, covariance, covariance_relative)
@@ -184,26 +184,7 @@ def _habits_report(nuisances: Nuisances, camera_names: tuple[str, ...]) -> Track
 
 def outline_variance(records: Mapping[int, FrameRecord], config: TrackingConfig) -> Array:
     """Return the variance times correlation length of the outline errors per arch [px^3], shape (2,)."""
-    residual = _of_tracked(records, residual_px)
-    typical = np.full(2, config.typical_noise_px3)
-    correlation = take_correlation_px(records, config)
-    for r in np.flatnonzero(np.isfinite(residual).any(0)):
-        typical[r] = np.nanmedian(residual[:, r]) ** 2 * correlation
-    return typical
-
-
-def take_correlation_px(records: Mapping[int, FrameRecord], config: TrackingConfig) -> float:
-    """Return the correlation length of outline errors, the median over the frames of a take [px]."""
-    if config.known_correlation_px is not None:
-        return config.known_correlation_px
-    values = _of_tracked(records, lambda solution: correlation_px(solution, config))
-    values = values[np.isfinite(values)]
-    return float(np.median(values)) if len(values) else config.correlation_px
-
-
-def _of_tracked(records: Mapping[int, FrameRecord], figure: Callable[[Solution], Array]) -> Array:
-    """Return a value of every frame and arch, NaN where the arch is lost, shape (F, 2)."""
-    return np.stack([np.where(r.found, figure(r.solution), np.nan) for r in records.values()])
+    return outline_errors(((r.solution, r.found) for r in records.values()), config)[0]
 
 
 def _covariances(
