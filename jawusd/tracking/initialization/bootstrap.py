@@ -271,8 +271,8 @@ def _refined(sightings: Sequence[_Sighting], pose: Array) -> Array:
         for s in sightings:
             residual, _, slope = _residuals_px(s, pose)
             p = transform_point(pose, s.point) - centre
-            turn = np.stack([np.cross(p, direction) for direction in slope.reshape(-1, 3)])
-            J = np.hstack([turn, slope.reshape(-1, 3)])
+            slope = slope.reshape(-1, 3)
+            J = np.hstack([np.cross(p, slope), slope])
             H += J.T @ J
             g -= J.T @ residual.ravel()
         twist = np.asarray(np.linalg.solve(H, g), np.float64)

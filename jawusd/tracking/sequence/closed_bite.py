@@ -86,7 +86,8 @@ def _moved_mm(one: Array, other: Array, probes: Array) -> float:
 _BITE_MM = 0.03  # scale of the Student distribution of the registration error [mm], including the effect of bite force
 _ARCH_MM = 25.0  # lever arm that converts this scale to a rotation [mm]
 _DEGREES_OF_FREEDOM = 4.0  # of this distribution: about 1 % of registrations are off by ten times the scale
-#: Fraction of the outline error variance that is constant over a take, in addition to annotator bias [-].
+#: Fraction of the outline error variance that is constant over a take, in addition to annotator bias [-]: if it were
+#: larger, noise in a few frames with closed teeth would shift the whole take.
 STEADY = 0.3
 _FEWEST_FRAMES = 2
 # Effective number of independent measurements per frame with closed teeth, and maximum for all such frames:
