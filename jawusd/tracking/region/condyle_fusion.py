@@ -65,16 +65,11 @@ def widen_strained(tracks: Tracks, landmarks: Array, axes: Array) -> Tracks:
 
 @dataclass(frozen=True, eq=False)
 class CondyleFusion:
-    """Fuses all poses of a take with the condylar motion learned from them; see `results.Fusion`.
+    """Fuses all poses of a take with the condylar motion learned from them; see `results.Fusion`."""
 
-    Attributes:
-        landmarks, axes: as in `CondyleMotion`.
-        least_mm: minimum standard deviations of the incisal point after the fusion [mm], shape (F,); default: none.
-    """
-
-    landmarks: Array
-    axes: Array
-    least_mm: Array | None = None
+    landmarks: Array  # as in `CondyleMotion`
+    axes: Array  # as in `CondyleMotion`
+    least_mm: Array | None = None  # minimum standard deviations of the incisal point after the fusion [mm], shape (F,)
 
     def __call__(self, poses: Array, covariance: Array, between: Array) -> tuple[Array, Array, Array]:
         """Return the fused poses and covariances; covariances of implausible frames are inflated first.

@@ -9,39 +9,22 @@ _Gates = tuple[float, ...]
 
 @dataclass(frozen=True)
 class Effort:
-    """Steps of an alignment, conditions for starting searches, and sizes of searches.
+    """Steps of an alignment, conditions for starting searches, and sizes of searches."""
 
-    Attributes:
-        gates_px: residual gates of the steps of an alignment that starts from the prediction.
-        next_px: residual gates after one dropped frame.
-        far_px: residual gates after several dropped frames.
-        wide_px: residual gates for other starts and at the end of a search; None to use the gates for the prediction.
-        uncertain, searched: fractions of the usual matched contour below which other starts are tried, and below which
-            a search starts, provided that hardly any frames were dropped.
-        jaws, finalists, heads: numbers of jaw poses tried by a search, of jaw poses aligned fully, and of head poses
-            tried.
-        search_every: interval between searches, in failed frames.
-        searches: number of failed frames after which teeth count as not visible.
-        later_every: like `search_every`, once teeth count as not visible.
-        in_turn: whether jaw and head are searched for in different frames once teeth count as not visible, to limit the
-            time per frame.
-        learn_every: interval between updates of the colours, in frames.
-    """
-
-    gates_px: _Gates
-    next_px: _Gates
-    far_px: _Gates
-    wide_px: _Gates | None
-    uncertain: float
-    searched: float
-    jaws: int
-    finalists: int
-    heads: int
-    search_every: int
-    searches: int
-    later_every: int
-    in_turn: bool
-    learn_every: int
+    gates_px: _Gates  # residual gates of the steps of an alignment that starts from the prediction
+    next_px: _Gates  # residual gates after one dropped frame
+    far_px: _Gates  # residual gates after several dropped frames
+    wide_px: _Gates | None  # residual gates for other starts and at the end of a search; None: `gates_px`
+    uncertain: float  # fraction of the usual matched contour below which other starts are tried
+    searched: float  # fraction below which a search starts, provided that hardly any frames were dropped
+    jaws: int  # number of jaw poses tried by a search
+    finalists: int  # number of jaw poses aligned fully
+    heads: int  # number of head poses tried
+    search_every: int  # interval between searches, in failed frames
+    searches: int  # number of failed frames after which teeth count as not visible
+    later_every: int  # like `search_every`, once teeth count as not visible
+    in_turn: bool  # whether jaw and head are then searched for in different frames, to limit the time per frame
+    learn_every: int  # interval between updates of the colours, in frames
 
 
 #: Residual gates of an alignment that starts from the prediction, and of one that starts from a more distant pose [px].
@@ -64,8 +47,7 @@ THOROUGH = Effort(
     in_turn=False,
     learn_every=1,
 )
-#: Effort for live images. Since frames are dropped during a search, searches are less frequent than for recorded
-#: images.
+#: Effort for live images; searches are less frequent, since frames are dropped during a search.
 FAST = Effort(
     gates_px=(8.0, 3.0, 2.0),
     next_px=(16.0, 6.0, 2.5, 2.0),

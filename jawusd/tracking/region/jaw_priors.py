@@ -156,17 +156,11 @@ def _features(incisor: Array) -> tuple[Array, Array]:
 
 @dataclass(frozen=True, eq=False)
 class BiteTerm:
-    """Penalises lower teeth that lie above their position in the occlusion of the scans.
+    """Penalises lower teeth that lie above their position in the occlusion of the scans."""
 
-    Attributes:
-        points: points on the lower teeth, in scan coordinates [mm], shape (N, 3).
-        up: normal of the occlusal plane in scan coordinates, shape (3,).
-        noise_px3: variance of border errors times their correlation length.
-    """
-
-    points: Array
-    up: Array
-    noise_px3: float
+    points: Array  # points on the lower teeth, in scan coordinates [mm], shape (N, 3)
+    up: Array  # normal of the occlusal plane in scan coordinates, shape (3,)
+    noise_px3: float  # variance of border errors times their correlation length
 
     def accumulate(self, state: Solution, equations: NormalEquations) -> None:
         """Add the squared heights above occlusion at the solution's poses, in units of the outline's sum of squares."""

@@ -59,27 +59,16 @@ _CLEARLY = 1.05  # minimum ratio of matched contour for another pose to replace 
 
 @dataclass(frozen=True, eq=False)
 class PictureShot:
-    """Input of a solve.
+    """Input of a solve."""
 
-    Attributes:
-        cuts: function that returns the cropped images.
-        find: function that searches for the teeth.
-        cameras: cameras in the order of the images.
-        frames: frame numbers of the reference camera.
-        fps: frames per second.
-        fixed_head: whether the cameras are head-mounted, so that the head pose is constant.
-        free_focal: whether to estimate the focal lengths.
-        skin: jaw parameters estimated from facial skin, if known.
-    """
-
-    cuts: Cuts
-    find: Find
-    cameras: Sequence[Camera]
-    frames: range
+    cuts: Cuts  # returns the cropped images
+    find: Find  # searches for the teeth
+    cameras: Sequence[Camera]  # cameras in the order of the images
+    frames: range  # frame numbers of the reference camera
     fps: float
-    fixed_head: bool = False
-    free_focal: bool = False
-    skin: SkinOf | None = None
+    fixed_head: bool = False  # whether the cameras are head-mounted, so that the head pose is constant
+    free_focal: bool = False  # whether to estimate the focal lengths
+    skin: SkinOf | None = None  # jaw parameters estimated from facial skin, if known
 
 
 class PictureTake:

@@ -134,23 +134,14 @@ def footage_findings(tracks: Tracks) -> list[Finding]:
 
 @dataclass(frozen=True, eq=False)
 class TakeFacts:
-    """Properties of a take that apply to all its frames.
+    """Properties of a take that apply to all its frames."""
 
-    Attributes:
-        cameras: cameras in the order of the views.
-        scans: upper and lower scan.
-        landmarks: landmarks in mandible coordinates [mm], shape (5, 3).
-        axes: rotation from scan to anatomical axes: left, up, front; shape (3, 3).
-        rest_frame: frame with closed teeth, as specified in the capture, or None.
-        registers: whether to register the lower scan by the frames with closed teeth.
-    """
-
-    cameras: Sequence[Camera]
-    scans: Sequence[Scan]
-    landmarks: Array
-    axes: Array
-    rest_frame: int | None = None
-    registers: bool = False
+    cameras: Sequence[Camera]  # cameras in the order of the views
+    scans: Sequence[Scan]  # upper and lower scan
+    landmarks: Array  # landmarks in mandible coordinates [mm], shape (5, 3)
+    axes: Array  # rotation from scan to anatomical axes: left, up, front; shape (3, 3)
+    rest_frame: int | None = None  # frame with closed teeth, as specified in the capture
+    registers: bool = False  # whether to register the lower scan by the frames with closed teeth
 
 
 def tracks_of(
