@@ -93,10 +93,10 @@ class PictureSearch(Generic[T]):
     def run(self, frames: range, progress: Progress, up_world: Array | None = None) -> Start[T]:
         """Return the first start that fits clearly, or else the best one among some frames.
 
-        Without `up_world`, the up direction of the head in the world (3,), four camera orientations are tried. If it is
-        known from other frames, only one is tried and, with several cameras, the first start that fits is returned,
-        because it can be compared with those frames. If no start of several cameras fits clearly, starts of single
-        cameras are tried in the frame with the best one.
+        Without `up_world`, the up direction of the head in the world (3,), four camera orientations are tried and, if
+        no start of several cameras fits clearly, starts of single cameras in the frame with the best one. If it is
+        known from other frames, only one orientation is tried and, with several cameras, the first start that fits is
+        returned, because it can be compared with those frames.
 
         Raises:
             TrackingError: no start fits.
@@ -125,7 +125,8 @@ class PictureSearch(Generic[T]):
                         return best
             if len(tried) >= _MOST_TRIED or (best is not None and best.fit >= least):
                 break
-        best = max(filter(None, [best, *self._alone(nearest)]), key=lambda start: start.fit, default=None)
+        if up_world is None:
+            best = max(filter(None, [best, *self._alone(nearest)]), key=lambda start: start.fit, default=None)
         if best is not None and best.fit >= least:
             return best
         raise TrackingError(
