@@ -85,17 +85,20 @@ class RigAuthoring(RigArrays):
         inside: bool = True,
         tangents: ArrayLike | None = None,
     ) -> Array:
-        """Return jaw parameters [mm] between keys, shape (*at.shape, 3).
+        """Return jaw parameters between keys.
 
         Args:
             frames: Increasing key times, shape (K,).
             d_keys: Jaw parameters [mm] at the keys, shape (K, 3).
-            at: Query times, any shape; d is constant before the first key and after the last one.
-            method: "linear", or "smooth" for a C1 curve, monotone between keys.
-            inside: Where the smooth curve between two valid keys would leave the bound, follow the bound; the curve is
-                then only continuous. See `keep_inside` for keys outside the bound.
-            tangents: Slopes of the smooth curve at the keys [mm per unit of time], shape (K, 3); NaN and None: monotone
-                ones.
+            at: Query times, any shape; before the first key and after the last one, d is constant.
+            method: "linear" for straight lines in d as in the paper, or "smooth" for a C1 curve, monotone between keys.
+            tangents: Slopes of the smooth curve at the keys [mm per unit of time], shape (K, 3); NaN and None: those
+                with which it is monotone between keys. Lines do not use them.
+            inside: Where the smooth curve between two valid keys would leave the bound, follow the bound instead; the
+                curve is then only continuous. See `keep_inside` for keys outside the bound.
+
+        Returns:
+            Jaw parameters [mm], shape (*at.shape, 3).
 
         Raises:
             ValueError: wrong shapes, keys that are not finite, infinite tangents, frames that do not increase, or an
@@ -115,10 +118,18 @@ class RigAuthoring(RigArrays):
         return d.reshape(*batch, 3)
 
     def keep_inside(self, times: ArrayLike, d: ArrayLike) -> Inside:
-        """Return a motion, d (F, 3) [mm] at increasing times (F,), linear in between, clamped to the bound everywhere.
+        """Return a motion clamped to the bound, both at its samples and on the straight lines between them.
 
-        Poses outside the bound are moved inside continuously, and no step becomes more than 5 % longer. Where the path
-        inside is too long for this limit, the motion just before and after it is retimed as well.
+        Poses outside the bound are moved inside continuously, and no step becomes more than 5 % longer than in the
+        given motion. Where the path inside the bound is too long for this limit, the motion just before and after it is
+        retimed as well.
+
+        Args:
+            times: Increasing sample times, shape (F,).
+            d: Jaw parameters [mm], interpolated linearly, shape (F, 3).
+
+        Returns:
+            The samples at the given times, and additional ones where straight lines between them would leave the bound.
 
         Raises:
             ValueError: wrong shapes, samples that are not finite, or times that do not increase.
@@ -127,10 +138,16 @@ class RigAuthoring(RigArrays):
         return kept_inside(self.bound, *as_keys(times, d))
 
     def ranges(self, d1: ArrayLike, d2: ArrayLike = 0.0, d3: ArrayLike = 0.0) -> Ranges:
-        """Return the valid ranges [mm] of d2 at d1 and d3, and of d3 at d1 and d2; d1, d2, d3 [mm] broadcast to (...).
+        """Return the valid ranges of d2 and of d3, each varied with the other two parameters fixed.
 
-        Limits are NaN where no value is valid. The bound ends a few tenths of a mm inside ``d_range[0]``; for openings
-        between the two, the limits at the nearest valid opening are returned.
+        Args:
+            d1: Opening [mm]; d1, d2, d3 broadcast to one shape (...).
+            d2: Laterotrusion [mm] while d3 varies.
+            d3: Protrusion [mm] while d2 varies.
+
+        Returns:
+            The limits [mm]; NaN where no value is valid. The bound ends a few tenths of a mm inside ``d_range[0]``;
+            for openings between the two, the limits at the nearest valid opening are returned.
         """
         each = (as_floats(x, name) for x, name in ((d1, "d1"), (d2, "d2"), (d3, "d3")))
         d = np.stack(np.broadcast_arrays(*each), axis=-1)
@@ -141,10 +158,16 @@ class RigAuthoring(RigArrays):
         return Ranges(*(end.reshape(batch) for pair in ends for end in pair))
 
     def normalized(self, d: ArrayLike) -> Array:
-        """Return d (..., 3) [mm] as fractions of this subject's ranges, for retargeting to another subject.
+        """Return d as fractions of this subject's ranges, for retargeting to another subject.
 
         The opening is divided by the full opening; d2 and d3 are divided by the range on their side of the habitual
         path at that opening (at least 0.5 mm).
+
+        Args:
+            d: Jaw parameters [mm], shape (..., 3).
+
+        Returns:
+            Fractions, shape (..., 3): 1 is the full range.
         """
         rows, batch = as_rows(d, (3,), "d")
         return in_chunks(lambda d: d / self._reach_mm(d[:, 0], d), rows).reshape(*batch, 3)
@@ -173,9 +196,12 @@ class RigAuthoring(RigArrays):
         return in_chunks(lambda d: nearest_distance(self.captured_d, d), rows).reshape(batch)
 
     def landmark_sigma_mm(self, d: ArrayLike) -> Array:
-        """Return the rms error of the model at its landmarks, (..., n) [mm], at d (..., 3) [mm]; 0 if unknown.
+        """Return the root mean square error of the model at its landmarks, shape (..., n) [mm]; 0 if unknown.
 
         It was estimated from held-out frames, and grows with the distance from the captured poses.
+
+        Args:
+            d: Jaw parameters [mm], shape (..., 3).
         """
         near_mm, growth = self.error_growth.T
         distance_mm = self.captured_distance(d)[..., None] if len(self.captured_d) else 0.0

@@ -157,9 +157,16 @@ class RigClearance:
     joints: ContactField | None
 
     def clearance(self, d: ArrayLike, *, of: Meeting = "teeth") -> Clearance:
-        """Return how far the teeth, or the condyles and the skull, are from penetrating deeper than in the closed bite.
+        """Return how far the teeth are from penetrating deeper than in the closed bite of the scans.
 
-        It is 0 for the teeth in the closed bite, saturates at about 1.5 mm and is constant far outside the bound.
+        Args:
+            d: Jaw parameters [mm], shape (..., 3).
+            of: "teeth", or "condyles" for the clearance between condyles and skull.
+
+        Returns:
+            The clearance [mm], shape (...), and its derivative with respect to d [mm/mm], shape (..., 3). The clearance
+            saturates at about 1.5 mm and is constant far outside the bound. The clearance of the teeth is 0 in the
+            closed bite.
 
         Raises:
             EvaluatorError: The rig has no such clearance; see `contact` and `joints`.

@@ -32,11 +32,15 @@ class RigJudging(RigClearance, RigArrays):
     polygons: PolygonBound  # the paper's bound
 
     def margin(self, d: ArrayLike, *, bound: BoundName = "slices") -> Array:
-        """Return the signed distance (...) [mm] of d (..., 3) [mm] to the bound: positive inside, finite outside.
+        """Return the signed distance of d to the bound [mm]: positive inside, finite and smooth outside.
 
         Args:
-            bound: "slices", the smooth joint bound of all three parameters, or "polygons", the paper's two outlines in
+            d: Jaw parameters [mm], shape (..., 3).
+            bound: "slices", the joint bound of all three parameters, or "polygons", the paper's two outlines in
                 (d1, d2) and (d1, d3), whose margin is continuous but not smooth.
+
+        Returns:
+            Margins [mm], shape (...); a float for one d.
         """
         if bound != "slices":
             rows, batch = as_rows(d, (3,), "d")
@@ -52,7 +56,10 @@ class RigJudging(RigClearance, RigArrays):
         return self.kernels.margins(rows).reshape(batch)[()]  # a number without batch axes
 
     def is_inside(self, d: ArrayLike, *, bound: BoundName = "slices") -> Mask:
-        """Return whether jaw parameters d (..., 3) [mm] have a margin of 0 or more, up to rounding of 1e-6 mm."""
+        """Return whether jaw parameters d (..., 3) [mm] lie inside the bound, i.e. have a margin of 0 or more.
+
+        The bound itself counts as inside, up to rounding of 1e-6 mm. The tolerance of measured poses does not apply.
+        """
         return is_inside(self.margin(d, bound=bound))
 
     def _polygons(self, bound: BoundName) -> PolygonBound:
@@ -70,15 +77,19 @@ class RigJudging(RigClearance, RigArrays):
         times_s: ArrayLike | None = None,
         speed_limit_mm_s: float | None = None,
     ) -> Verdicts:
-        """Judge measured poses (..., 4, 4) by rigidity, distance to the model, margin to the bound, collisions, speed.
+        """Judge measured poses by rigidity, distance to the model, margin to the bound, collisions and speed.
 
         Args:
+            T_skull_mandible: Poses, shape (..., 4, 4).
             residual_limit_mm: Largest landmark distance to the model; default: the rig's own limit.
             tolerance_mm: How far outside the bound a measured pose may lie; default: the rig's own tolerance. With 0
                 the poses are judged as authored: teeth may then penetrate less deeply than in measured poses.
             bound: "slices" or "polygons"; see `margin`.
             times_s: Times of the poses along the last batch axis, shape (F,); required with a speed limit.
             speed_limit_mm_s: Largest speed of a landmark since the last valid pose; None disables the check.
+
+        Returns:
+            Verdicts of the batch shape.
 
         Raises:
             ValueError: wrong shapes, a negative tolerance, or a speed limit without increasing times.
@@ -141,7 +152,9 @@ class RigJudging(RigClearance, RigArrays):
         bound: BoundName = "slices",
         speed_limit_mm_s: float | None = None,
     ) -> VerdictStream:
-        """Return an object that judges poses one at a time as `validate`, with its arguments, judges them together.
+        """Return an object that judges poses one at a time as `validate` judges them together.
+
+        The arguments are those of `validate`.
 
         Raises:
             ValueError: a negative tolerance, or an unknown bound.

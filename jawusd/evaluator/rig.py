@@ -119,9 +119,14 @@ class JawRig(RigJudging, RigAuthoring):
         return spatial.reshape(*batch, 6, 3)
 
     def point_jacobian(self, d: ArrayLike, p_mandible: ArrayLike) -> Array:
-        """Return the derivative [mm/mm] by d (..., 3) of the positions of mandible points in the skull frame.
+        """Return the derivative with respect to d of the positions of mandible points in the skull frame.
 
-        It has shape (..., 3, 3) for one point (3,) [mm], mandible frame, and (..., P, 3, 3) for points (P, 3).
+        Args:
+            d: Jaw parameters [mm], shape (..., 3).
+            p_mandible: Points [mm], mandible frame, shape (3,) or (P, 3).
+
+        Returns:
+            Jacobians [mm/mm], shape (..., 3, 3), or (..., P, 3, 3) for (P, 3) points.
         """
         rows, batch = as_rows(d, (3,), "d")
         points = as_points(p_mandible, "p_mandible")
@@ -134,17 +139,20 @@ class JawRig(RigJudging, RigAuthoring):
         return in_chunks(derivative, rows).reshape(*batch, *points.shape, 3)
 
     def pose_covariance(self, d: ArrayLike) -> Array:
-        """Return the covariance (..., 6, 6) of the rig's own error at d (..., 3) [mm]; 0 if unknown.
+        """Return the covariance (..., 6, 6) of the rig's own error at jaw parameters d (..., 3) [mm].
 
         The error is xi = (omega [rad], v [mm]) in the skull frame, with ``T_true = exp(xi) pose(d)``. Its covariance
-        reproduces `landmark_sigma_mm`.
+        reproduces `landmark_sigma_mm`; it is 0 if these are unknown.
         """
         rows, batch = as_rows(d, (3,), "d")
         points = transform_points(self.kernels.poses(rows), self.landmarks[None])
         return covariance_of_points(points, self.landmark_sigma_mm(rows)).reshape(*batch, 6, 6)
 
     def parameter_covariance(self, d: ArrayLike) -> Array:
-        """Return the covariance (..., 3, 3) [mm^2] of d (..., 3) [mm] due to the rig's own error; 0 if unknown."""
+        """Return the covariance (..., 3, 3) [mm^2] of d (..., 3) [mm] that follows from the rig's own error.
+
+        It is 0 if the error is unknown.
+        """
         rows, batch = as_rows(d, (3,), "d")
         found, own = np.zeros((len(rows), 3, 3)), self.pose_covariance(rows)
         known = own.any(axis=(1, 2))
@@ -164,15 +172,17 @@ class JawRig(RigJudging, RigAuthoring):
     def encode(
         self, T_skull_mandible: ArrayLike, *, inside: bool = False, covariance: ArrayLike | None = None
     ) -> Encoding | WeightedEncoding:
-        """Return the jaw parameters whose pose is nearest to each given one, by the rms distance of rig landmarks.
+        """Return the jaw parameters whose pose is nearest to each given one.
+
+        The distance is ``residual_mm``, the rms distance of the rig's landmarks between the two poses.
 
         Args:
             T_skull_mandible: Poses, shape (..., 4, 4). If a matrix is slightly non-rigid, the landmark positions it
                 yields are matched; matrices that are not rigid to 1e-3 give NaN.
             inside: Search only inside the bound.
-            covariance: Covariance of the noise xi = (omega [rad], v [mm]) of the poses, skull frame, shape (..., 6, 6)
-                or (6, 6), with ``T_true = exp(xi) T``. If given, the result is the most likely instead of the nearest
-                parameters, with their covariance, which disregards the bound.
+            covariance: Covariance of the noise of the poses, shape (..., 6, 6) or (6, 6); the noise is xi = (omega
+                [rad], v [mm]) in the skull frame, with ``T_true = exp(xi) T``. If given, the result is the most likely
+                instead of the nearest parameters, with their covariance, which disregards the bound.
 
         Raises:
             ValueError: wrong shapes, or a covariance that is not positive definite.
@@ -213,7 +223,13 @@ class JawRig(RigJudging, RigAuthoring):
         return self.kernels.margin_gradients(rows).reshape(*batch, 3)
 
     def project(self, d: ArrayLike) -> Array:
-        """Return the valid parameters (..., 3) [mm] nearest to d, in the Euclidean sense: d itself inside the bound.
+        """Return the nearest valid jaw parameters: d itself inside the bound, otherwise the nearest with margin >= 0.
+
+        Args:
+            d: Jaw parameters [mm], shape (..., 3).
+
+        Returns:
+            Valid jaw parameters [mm], shape (..., 3); nearest in the Euclidean sense in d.
 
         Raises:
             EvaluatorError: the bound of the rig is empty.
@@ -235,15 +251,17 @@ class JawRig(RigJudging, RigAuthoring):
         Args:
             p_mandible: One handle (3,) or several (H, 3) [mm], mandible frame.
             p_skull: Targets [mm], skull frame, shape (..., 3) for one handle, (..., H, 3) for several.
-            start: Initial d [mm], shape (..., 3), projected if outside the bound. While dragging, pass the last result,
-                so that the jaw moves without jumps. Default: the best of many points spread over the valid volume.
+            start: Initial d [mm], shape (..., 3). While dragging, pass the last result, so that the jaw moves without
+                jumps. A start outside the bound is first projected. Default: the best of many points spread over the
+                valid volume.
             weights: Weights of the handles, shape (H,), >= 0 and not all zero; default: equal.
             sight: Directions along which distances do not count, skull frame, of the shape of p_mandible; 0 for handles
                 whose whole distance counts. Along these directions, the jaw follows the habitual path: in a frontal
                 view d3 becomes 0, in a lateral view d2. Vertical directions leave the opening undetermined.
 
         Returns:
-            d inside the bound, and the weighted rms distance [mm] of handles and targets, perpendicular to `sight`.
+            d, always inside the bound, and the weighted rms distance between handles and targets, perpendicular to
+            `sight`.
 
         Raises:
             ValueError: wrong shapes or weights, or a sight that is not finite.

@@ -54,7 +54,11 @@ class SubjectAnatomy:
         mandible_vertices: ArrayLike | None,
         T_rest: ArrayLike | None,
     ) -> SubjectAnatomy:
-        """Check the arrays; by default, the points are the landmarks and the closed bite is the identity."""
+        """Check the arrays; by default, the points are the landmarks and the closed bite is the identity.
+
+        Raises:
+            ValueError: an array has a wrong shape or is not finite.
+        """
         landmarks = _array(landmarks, (len(LANDMARKS), 3), "landmarks")
         vertices = landmarks if mandible_vertices is None else mandible_vertices
         return cls(
@@ -130,6 +134,9 @@ def select_tracks(tracks: Tracks, anatomy: SubjectAnatomy) -> Selection:
     """Select the frames of a take that can train a model: those measured without a prior and with a small covariance.
 
     Raises like `select_poses`.
+
+    Raises:
+        FittingError: there are too few frames, or there is no motion.
     """
     T = tracks.raw_T_upper_lower
     finite = np.all(np.isfinite(T), axis=(1, 2))

@@ -37,7 +37,7 @@ class PngMasks:
         labels: LabelValues | None = None,
         is_other: Callable[[RawImage], bool] | None = None,
     ) -> None:
-        """Find the files (width, height) of a pattern; `is_other` detects those that do not tell levels of masks.
+        """Find the files (width, height) of a pattern; `is_other` detects images that are not masks.
 
         Raises:
             CaptureError: the folder is missing, or contains no file of this pattern.

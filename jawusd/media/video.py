@@ -175,7 +175,7 @@ class Video(Clip):
                     dts.append(packet.pts if packet.dts is None else packet.dts)
                     key.append(packet.is_keyframe)
         except av.FFmpegError:
-            pass  # a truncated file: use the images before the truncation; `announced` reveals it
+            pass  # a truncated file: use the images before the truncation, fewer than `announced`
         order = np.argsort(pts, kind="stable")
         times = np.array(pts, np.int64)[order]
         is_key = np.array(key, bool)[order]

@@ -277,7 +277,7 @@ def _scraps_joined(surface: ScanSurface, crown: Mask) -> Mask:
 
 
 def crown_by_colour(colors: NDArray[np.uint8], surface: ScanSurface, seen: Tops) -> Array | None:
-    """Return the probability (v,) that each vertex is crown, judged by its colour; None if colours tell nothing.
+    """Return the probability (v,) that each vertex is crown, by its colour; None if the colours are not informative.
 
     `colors` (V, 3) are the red, green and blue of each vertex of the scan.
     """

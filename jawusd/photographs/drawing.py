@@ -128,7 +128,7 @@ class Outlines:
 def split_teeth(scan: Scan, T_anatomical_scan: Array, arch: int) -> Crowns:
     """Return the crowns of a scan as connected pieces, given T_anatomical_scan (4, 4); `arch` is 0 upper, 1 lower.
 
-    Without gum in the scan, a strip of faces hides teeth on the far side of the arch, as gum does in photographs.
+    A scan without gum gets a strip of faces in its place, which occludes the far side of the arch as gum does.
     """
     faces = scan.crown_faces
     pairs = (faces.ravel(), np.roll(faces, 1, axis=1).ravel())

@@ -96,7 +96,12 @@ def bake_subject(
 
 @explain_missing_packages()
 def write_take(capture: Capture, tracks: Tracks, folder: Path) -> list[Path]:
-    """Write the cameras and the captured head motion to the rig's folder; return the files written."""
+    """Write the cameras and the captured head motion to the rig's folder; return the files written.
+
+    Raises:
+        CalibrationError: a camera of the capture has no calibration.
+        RigError, OutputError: the take cannot be written.
+    """
     from jawusd.rig.cameras import write_cameras
 
     return write_cameras(

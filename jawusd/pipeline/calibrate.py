@@ -133,7 +133,11 @@ def sync_cameras(capture: Capture, progress: Progress) -> SyncResult:
 
 @explain_missing_packages()
 def sync_videos(videos: Mapping[str, Path | ClipSource], reference: str, progress: Progress) -> SyncResult:
-    """Return the frame offset of every camera's clip relative to the reference; see `capture.sync.align_videos`."""
+    """Return the frame offset of every camera's clip relative to the reference; see `capture.sync.align_videos`.
+
+    Raises:
+        SyncError, CaptureError: see `capture.sync.align_videos`.
+    """
     from jawusd.capture.sync import align_videos
 
     progress("sync", 0, 1)
@@ -168,7 +172,11 @@ def light_curves(videos: Mapping[str, Path | ClipSource], progress: Progress) ->
 
 
 def write_light_curves(path: Path, curves: Mapping[str, LightCurve]) -> None:
-    """Write the mean brightness of every image as CSV: camera, image, time_s, brightness."""
+    """Write the mean brightness of every image as CSV: camera, image, time_s, brightness.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
     lines = ["camera,picture,time_s,brightness"]
     for name, curve in curves.items():
         pictures = enumerate(zip(curve.times_s, curve.brightness))

@@ -144,7 +144,8 @@ def read_motion(
     """Read tracks from tracks.npz, or poses and their frame rate from any other file; see `read_trajectory`.
 
     Raises:
-        FormatError: also if options are given for tracks.npz.
+        FormatError: the file is invalid, or it is tracks.npz, for which options do not apply.
+        MissingDependencyError: the file is HDF5, and h5py is not installed.
     """
     if Path(path).suffix != ".npz":
         frames, T, fps = read_trajectory(path, options)

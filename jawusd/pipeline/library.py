@@ -36,7 +36,12 @@ _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 
 @explain_missing_packages()
 def load_any_rig(path: Path) -> JawRig:
-    """Read a rig from `model.npz`, which needs only numpy, or from any USD layer that contains it."""
+    """Read a rig from `model.npz`, which needs only numpy, or from any USD layer that contains it.
+
+    Raises:
+        JawusdError: the file is not a rig.
+        MissingDependencyError: the file is USD, and OpenUSD is not installed.
+    """
     if path.suffix == ".npz":
         return load(path)
     from jawusd.rig import load_rig
@@ -89,7 +94,12 @@ def _no_frames() -> tuple[NDArray[np.int64], Array, Array, Mask]:
 
 @explain_missing_packages()
 def plot_ranges(entries: Sequence[Entry], folder: Path, force: bool) -> list[Path]:
-    """Plot the ranges of motion of a library's subjects side by side, as PNG and SVG; return the files."""
+    """Plot the ranges of motion of a library's subjects side by side, as PNG and SVG; return the files.
+
+    Raises:
+        MissingDependencyError: matplotlib is not installed.
+        OutputError: a file exists already, or cannot be written.
+    """
     from jawusd.report.figures import RANGES, ranges_figure
     from jawusd.report.style import save_figure
 
@@ -135,7 +145,11 @@ def personal_rig(landmarks: Path, library: Library, *, closest: bool, name: str,
 
 @explain_missing_packages()
 def fit_personal(subject: Subject, motion: PersonalMotion, progress: Progress) -> JawModel:
-    """Fit the anchored model to motion transferred to a subject, and store the expected error in the model's header."""
+    """Fit the anchored model to motion transferred to a subject, and store the expected error in the model's header.
+
+    Raises:
+        FittingError: see `fitting.fit_model`.
+    """
     from jawusd.fitting import FittingConfig, fit_model
 
     model = fit_model(

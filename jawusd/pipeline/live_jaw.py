@@ -95,7 +95,11 @@ class LiveSkin:
         self._face: RecordedFace | FaceStream = (RecordedFace if whole else FaceStream)(self._skin, options)
 
     def play(self, begin_s: float, silence_s: float) -> None:
-        """Start a recording at `begin_s` on the live clock, or wait for the first row of a stream."""
+        """Start a recording at `begin_s` on the live clock, or wait for the first row of a stream.
+
+        Raises:
+            FormatError: a stream has no row within `silence_s` [s], or an invalid one.
+        """
         self._face.play(begin_s, silence_s)
 
     def stop(self) -> None:
@@ -192,7 +196,11 @@ class FaceStream:
         self._stopped.set()
 
     def at(self, time_s: float) -> Array:
-        """Return the columns (K,) at a time of the live clock [s], waiting for the row after it; NaN where unknown."""
+        """Return the columns (K,) at a time of the live clock [s], waiting for the row after it; NaN where unknown.
+
+        Raises:
+            FormatError: a row is invalid, or has other columns than the map.
+        """
         with self._changed:
             left_s = max(0.0, time_s + _LATE_S - live_source.now_s())
             self._changed.wait_for(lambda: self._error or self._rows[-1][0] + self._offset_s() > time_s, left_s)

@@ -132,6 +132,7 @@ def write_plates(
 
     Raises:
         CaptureError, CalibrationError: see `open_footage`.
+        OutputError: the files cannot be written.
     """
     from jawusd.media.footage import PictureSequence
     from jawusd.media.writers import PlateWriter
@@ -162,7 +163,11 @@ def write_plates(
 
 
 def replay_parts(folder: Path, model: JawModel) -> tuple[ReplayPart, ...]:
-    """Return decimated meshes of a rig with the teeth closed, in the anatomical frame [mm], for the report."""
+    """Return decimated meshes of a rig with the teeth closed, in the anatomical frame [mm], for the report.
+
+    Raises:
+        RigError: the rig has no geometry.
+    """
     from jawusd.meshes.remeshing import decimated
     from jawusd.rig.geo import read_geometry, read_gum
 
@@ -211,6 +216,7 @@ def write_overlay(
     Raises:
         CaptureError, CalibrationError: see `open_footage`.
         FormatError: the tracks belong to another capture.
+        OutputError: the files cannot be written.
     """
     check_same_cameras(capture, tracks)
     if path.suffix.lower() == VIDEO:
@@ -284,7 +290,11 @@ def open_wall(
     scans: tuple[Mesh, Mesh],
     tile_px: tuple[int, int],
 ) -> CameraWall:
-    """Return a renderer of the images of all cameras side by side, each cropped to the teeth."""
+    """Return a renderer of the images of all cameras side by side, each cropped to the teeth.
+
+    Raises:
+        CaptureError, CalibrationError: no camera has video or masks, or one cannot be read.
+    """
     from jawusd.media.side_by_side import CameraWall
 
     backdrops = open_backdrops(capture, offsets)

@@ -29,7 +29,9 @@ def write_page(
 
     Raises:
         CaptureError: there is no footage, or it cannot be decoded.
+        OutputError: the file cannot be written.
         RigError: the contacts of the teeth cannot be computed from the rig's meshes.
+        MissingDependencyError: a package is missing.
     """
     from jawusd.report.pose_page import PosePage, write_pose_page
     from jawusd.rig.read import describe

@@ -256,7 +256,11 @@ def attempt(what: str, left_out: list[str], work: Callable[[], T]) -> T | None:
 
 
 def recorded_offsets(state: BuildState) -> dict[str, int]:
-    """Return the recorded frame offset of every camera; empty if the build did not synchronise them."""
+    """Return the recorded frame offset of every camera; empty if the build did not synchronise them.
+
+    Raises:
+        FormatError: build.json is corrupt.
+    """
     return (state.result("sync", SyncNotes) or {}).get("offsets", {})
 
 
@@ -305,7 +309,11 @@ def run_paper_experiments(
 
 @explain_missing_packages()
 def draw_experiments(found: Experiments, folder: Path) -> list[Path]:
-    """Write the figures and the table of the experiments to a folder; return the files written."""
+    """Write the figures and the table of the experiments to a folder; return the files written.
+
+    Raises:
+        OutputError: a file cannot be written.
+    """
     from jawusd.paper import figures
 
     files = figures.draw_experiments(found, folder)

@@ -93,6 +93,10 @@ def store_labels(capture: Capture, folder: Path) -> list[Path]:
     """Write the labels of both teeth scans to a folder if either is labelled by shape; return the files written.
 
     Labels written by an earlier call are deleted.
+
+    Raises:
+        FormatError, CaptureError: a scan or its labels cannot be read.
+        OutputError: a file cannot be written.
     """
     scans = labelled_teeth(capture, capture.scans.labels)
     written = []
@@ -117,7 +121,11 @@ def with_stored_labels(capture: Capture, folder: Path) -> Capture:
 
 
 def save_reviewed(scans: Scans, meshes: Mapping[str, Mesh], arch: str, labels: NDArray[np.uint8]) -> Path:
-    """Write the reviewed labels (V,) of one of the scans (by arch) to its label file; return the file."""
+    """Write the reviewed labels (V,) of one of the scans (by arch) to its label file; return the file.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
     path = labels_path(getattr(scans, TEETH[arch]), scans.labels)
     save_scan_labels(path, ScanLabels(labels, "reviewed"), meshes[arch])
     return path

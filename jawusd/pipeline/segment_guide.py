@@ -29,7 +29,11 @@ GUIDE, _FAMILY = "guide.npz", "jawusd-guide"
 
 
 def save_guide(folder: Path, inputs: str, guide: Mapping[int, RegionPose]) -> None:
-    """Write poses tracked by colour, with the hash of the inputs used."""
+    """Write poses tracked by colour, with the hash of the inputs used.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
     frames = sorted(guide)
     meta = {"format": f"{_FAMILY}/1", "units": UNITS, "twist_order": TWIST_ORDER, "inputs": inputs}
     arrays = {"meta": np.array(json.dumps(meta)), "frames": np.array(frames)}

@@ -137,7 +137,11 @@ class Journal:
             raise OutputError(f"cannot be written: {error.strerror}.", path=self._path) from error
 
     def drop(self, frames: Iterable[int]) -> None:
-        """Remove frames."""
+        """Remove frames.
+
+        Raises:
+            OutputError: the file cannot be written.
+        """
         for frame in frames:
             del self.entries[frame]
         kept = [self._head, *(_line(frame, entry) for frame, entry in self.entries.items())]
@@ -238,6 +242,7 @@ def write_summary(capture: Capture, entries: Mapping[int, FrameEntry], folder: P
     Raises:
         CaptureError: an image or mask cannot be read.
         FormatError: the file of learned parameters is corrupt.
+        OutputError: a file cannot be written.
     """
     rows = summarise(entries)
     uncertain = sorted((row for row in rows if row["confidence"] < _LOW_CONFIDENCE), key=lambda row: row["confidence"])

@@ -244,6 +244,7 @@ def learn_skin(
         The map from face to d, and the offset [s].
 
     Raises:
+        FittingError: see `fitting.skin.clock_offset` and `fitting.skin.fit_skin`.
         ValueError: a frame rate is missing.
     """
     if not jaw.fps or not face.fps:
@@ -263,7 +264,11 @@ def learn_jaw_weights(
     offset_s: float | None = None,
     head_error: tuple[float, float] = (0.0, 0.0),
 ) -> tuple[Skin, float]:
-    """Learn to estimate d from the four ARKit jaw weights; see `learn_skin` and `fitting.face.check_jaw_weights`."""
+    """Learn to estimate d from the four ARKit jaw weights; see `learn_skin` and `fitting.face.check_jaw_weights`.
+
+    Raises:
+        FittingError: see `fitting.face.check_jaw_weights`.
+    """
     skin, offset_s = learn_skin(rig, jaw, face, offset_s, head_error)
     face_s, times_s = face.frames / (face.fps or 1.0), jaw.frames[jaw.seen] / (jaw.fps or 1.0)
     check_jaw_weights(rig, columns_at(face_s + offset_s, face.X, times_s), jaw.d[jaw.seen], skin.errors_mm["skin"])

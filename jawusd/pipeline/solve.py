@@ -197,7 +197,12 @@ def write_solved(
     fps: float,
     prim: str | None = None,
 ) -> None:
-    """Write a performance to a file whose suffix selects the format; see `solve`."""
+    """Write a performance to a file whose suffix selects the format; see `solve`.
+
+    Raises:
+        OutputError: the file cannot be written.
+        RigError: an animation layer of the rig cannot be written.
+    """
     suffix = Path(out).suffix.lower()
     if suffix == ".csv":
         write_performance(out, performance, fps)

@@ -67,7 +67,11 @@ class VideoShot:
         options: VideoOptions,
         progress: Progress,
     ) -> None:
-        """Open the videos of calibrated cameras, given by name."""
+        """Open the videos of calibrated cameras, given by name.
+
+        Raises:
+            CaptureError: no camera has a video, or one cannot be decoded.
+        """
         videos = open_videos(capture)
         self._picks, self._teeth, self._progress = capture.bootstrap, teeth, progress
         self.cameras = {name: camera for name, camera in cameras.items() if name in videos}

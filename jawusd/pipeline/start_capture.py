@@ -72,7 +72,11 @@ def start_capture(folder: Path, square_mm: float | None, fps: float | None, prog
 
 
 def write_start(start: CaptureStart) -> None:
-    """Write capture.toml."""
+    """Write capture.toml.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
     write_text_atomic(start.path, capture_text(start.sketch))
 
 

@@ -157,7 +157,11 @@ def read_files(files: Mapping[str, Path]) -> dict[str, Mesh]:
 
 
 def labelled_teeth(capture: Capture, folder: Path | None, *, ignore_files: bool = False) -> list[LabelledScan]:
-    """Return the upper and the lower scan with labels; see `label_teeth` and, for errors, `load_meshes`."""
+    """Return the upper and the lower scan with labels; see `label_teeth` and, for errors, `load_meshes`.
+
+    Raises:
+        CaptureError, FormatError: see `load_meshes`.
+    """
     files = {name: getattr(capture.scans, name) for name in TEETH.values()}
     return list(label_teeth(read_files(files), files, folder, ignore_files=ignore_files).values())
 

@@ -57,7 +57,11 @@ class Cutter:
         return cut
 
     def walk(self, footage: ColourFootage, frames: range) -> Iterator[Cut]:
-        """Yield the function returned by `cut` for each frame."""
+        """Yield the function returned by `cut` for each frame.
+
+        Raises:
+            CaptureError: an image cannot be decoded.
+        """
         return (self.cut(pictures) for _, pictures in footage.walk(frames))
 
     def _one(self, name: str, pictures: Pictures, around: Array) -> Picture | None:
@@ -96,6 +100,9 @@ class Follower:
         """Refine T_world_upper, T_world_lower (2, 4, 4) in the frame from which `run` will start; return them, and fit.
 
         The fit is the fraction of the contour in sight that matches the colours, 0 .. 1, for the worse arch.
+
+        Raises:
+            CaptureError: an image cannot be decoded.
         """
         cutter = Cutter(self.cameras, self._scans, teeth_centre(self._scans, poses), self._pool)
         axes = self._subject.T_anatomical_skull[:3, :3]
@@ -114,7 +121,11 @@ class Follower:
         return begin
 
     def run(self, frames: range, search: PictureSearch[Array], progress: Progress) -> dict[int, RegionPose]:
-        """Return the poses of all frames, from the frame last passed to `start_at`; search where the teeth are lost."""
+        """Return the poses of all frames, from the frame last passed to `start_at`; search where the teeth are lost.
+
+        Raises:
+            CaptureError: an image cannot be decoded.
+        """
         points, up = self._subject.landmarks[:3], self._subject.T_anatomical_skull[1, :3]
 
         def again(lost: range, near: RegionPose) -> Begin[RegionPose]:

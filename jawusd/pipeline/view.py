@@ -138,7 +138,12 @@ class ContactView:
 
     @explain_missing_packages()
     def draw(self, d: Array) -> NDArray[np.uint8]:
-        """Return an image, RGB (h, w, 3), of both arches at d (3,) [mm]; raises like `teeth`."""
+        """Return an image, RGB (h, w, 3), of both arches at d (3,) [mm].
+
+        Raises:
+            RigError: tooth contact cannot be computed from the rig's meshes.
+            MissingDependencyError: a package is missing.
+        """
         return self._map.draw(self._rig.pose(d))
 
 

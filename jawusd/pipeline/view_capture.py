@@ -52,7 +52,11 @@ def open_capture_viewer(
     *,
     allow_outside: bool = False,
 ) -> CaptureViewer:
-    """Serve a capture to browsers; parameters and errors as for `viewed_capture`."""
+    """Serve a capture to browsers; parameters and errors as for `viewed_capture`.
+
+    Raises:
+        MissingDependencyError: the viewer is not installed.
+    """
     from jawusd.viewer.capture_page import CaptureViewer
 
     return CaptureViewer(viewed_capture(path, tracks, progress, allow_outside=allow_outside), host, port)

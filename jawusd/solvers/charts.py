@@ -80,10 +80,8 @@ class AnchoredMotion(MotionModule):
         away = q[:, None] - self.centres
         r = away.norm(dim=2)
         rows = [tail[i].unbind() for i in range(3)]
-        omega = (
-            torch.cat(spline(triple(q.split(1, dim=1)), self.centres, self.weights, rows, spread, OPERATIONS), dim=1)
-            - offset
-        )
+        inputs = triple(q.split(1, dim=1))
+        omega = torch.cat(spline(inputs, self.centres, self.weights, rows, spread, OPERATIONS), dim=1) - offset
         by_q = 3.0 * self.weights.T @ (away * r[:, :, None]) + tail.T
         columns = slopes[0][:, None], slopes[1][:, None]
         by_u = torch.stack(gradient_by_u(triple(by_q.unbind(dim=2)), scales, columns), dim=2)

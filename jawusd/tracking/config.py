@@ -61,8 +61,8 @@ class TrackingConfig:
     typical_noise_px3: float = 3.0
     # Assumed correlation length of outline errors along the contour [px], until it is measured on the take.
     correlation_px: float = 18.0
-    known_correlation_px: float | None = None  # the same if residuals cannot reveal it; None: measured
-    # Side of the tiles of summed errors that reveal the correlation length [px]: 20 to 45 give the same.
+    known_correlation_px: float | None = None  # known correlation length of outline errors [px]; None: measured
+    # Side of the tiles over which errors are summed to measure it [px]: estimates change little from 20 to 45.
     tile_px: int = 30
     tile_factor: float = 2.2  # ratio of true to measured correlation length [-]: the fit absorbs part of the error
     history_frames: int = 31  # number of recent good frames that define the usual residual and coverage: about a second

@@ -139,9 +139,12 @@ class MaskViews:
         ]
 
     def around(self, frame: int, reach: int) -> list[list[View]]:
-        """Return the views of a frame and of up to `reach` frames before and after it, in order; raises as `at`.
+        """Return the views of a frame and of up to `reach` frames before and after it, in order.
 
         Masks are decoded once and in file order, since every jump reopens the files.
+
+        Raises:
+            CaptureError: a mask cannot be decoded.
         """
         first, stop = frame - reach, frame + reach + 1
         cameras = []

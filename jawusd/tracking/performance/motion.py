@@ -93,7 +93,7 @@ def head_bends(coordinates: Coordinates, poses: Sequence[Pose]) -> tuple[Array, 
 def measured_motion(coordinates: Coordinates, poses: Sequence[Pose], good: Mask, fps: float) -> Motion:
     """Return the variances of a take's motion; if too few frames are good, those of the rig's training take.
 
-    `poses` are those of consecutive frames; `good`, shape (N,), tells whether both arches were found.
+    `poses` are those of consecutive frames; `good`, shape (N,), is whether both arches were found.
     """
     bend, step = head_bends(coordinates, poses)
     d = np.stack([pose.d for pose in poses])
