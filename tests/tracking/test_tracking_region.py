@@ -16,20 +16,24 @@ from jawusd.pipeline.segment_guide import known_guide, save_guide
 from jawusd.pipeline.subject import load_meshes, subject_of_capture
 from jawusd.pipeline.track_videos import Follower
 from jawusd.segmentation.picture import ColourFootage
+from jawusd.tracking.contour.equations import translation
+from jawusd.tracking.contour.quality import score_px
 from jawusd.tracking.contour.samples import COLUMNS, INVERSE_DEPTH, LENGTH, NX, NY, U, V, X, Y
 from jawusd.tracking.contour.scan import CROWN, prepare_scan
 from jawusd.tracking.contour.views import Drawn
 from jawusd.tracking.performance.coordinates import Pose
 from jawusd.tracking.region import rig_tracker
+from jawusd.tracking.region import search as region_search
 from jawusd.tracking.region import tracker as region_tracker
 from jawusd.tracking.region.colours import BINS, PATCHES, TABLES, Areas, CameraColours, colour_bins
 from jawusd.tracking.region.creases import search_creases
 from jawusd.tracking.region.edges import _light, search_borders, sharpen
 from jawusd.tracking.region.effort import THOROUGH
 from jawusd.tracking.region.rig_tracker import RigTracker
-from jawusd.tracking.region.search import fraction_in_sight
+from jawusd.tracking.region.search import InstantViews, PoseSearch, fraction_in_sight
 from jawusd.tracking.region.view import Counts, RegionView, measure_in_sight
 from jawusd.tracking.sequence.guided import GuidedTracker
+from jawusd.tracking.sequence.history import MotionPredictor
 
 TOOTH, LIP = np.array([215.0, 205.0, 185.0]), np.array([150.0, 75.0, 80.0])
 SIZE, MIDDLE, RADIUS = 120, 60.3, 30.4
@@ -345,6 +349,57 @@ def test_a_jaw_out_of_sight_is_searched_although_the_head_fits_less_than_usual(m
     one_way._rest = one_way._absent = one_way._missed = 0
     one_way._located([None], None, np.array([0.33, 0.3]))
     assert tried == ["head alone", "head", "jaw"]
+
+
+def solution_that_fits(upper_px, lower_px):
+    """Return a solution of one camera of which so much contour fits, of 100 px per arch."""
+    silhouette = SimpleNamespace(score_px=np.array([[upper_px], [lower_px]]))
+    margin, poses = SimpleNamespace(score_px=np.zeros((2, 1))), np.stack([np.eye(4)] * 2)
+    return SimpleNamespace(
+        silhouette=silhouette, gingival_margin=margin, visible_px=np.full((2, 1), 100.0), poses=poses
+    )
+
+
+@pytest.mark.parametrize("step", ["with_head_alone", "with_head_searched"])
+@pytest.mark.parametrize(
+    ("alone_px", "joint_px", "fitting_px"),
+    [
+        (61.0, (60.0, 20.0), (60.0, 20.0)),  # the head alone fits a little better, but the jaw fits as well
+        (61.0, (40.0, 10.0), (61.0, 0.0)),  # the jaw pulls the head away
+        (58.0, (60.0, 20.0), (59.0, 19.0)),  # the given solution's head fits better
+    ],
+)
+def test_a_jaw_is_aligned_again_after_its_head_alone(monkeypatch, step, alone_px, joint_px, fitting_px):
+    search = PoseSearch.__new__(PoseSearch)
+    search._axes, search._thin = np.eye(3), SimpleNamespace(scans=None)
+    search.condyles = SimpleNamespace(strain=lambda relative: 0.0)
+
+    def align(start, look, gates, firm=False, use=None):
+        return solution_that_fits(*joint_px) if use is None else solution_that_fits(alone_px, 0.0)
+
+    monkeypatch.setattr(search, "_align", align)
+    monkeypatch.setattr(region_search, "rank_by_colour", lambda *_: [0])
+    monkeypatch.setattr(region_search, "_upper_alone", lambda views: np.array([[True], [False]]))
+    look, poses = InstantViews([], None), np.stack([np.eye(4)] * 2)
+    rest = (True,) if step == "with_head_searched" else ()
+    found = getattr(search, step)(solution_that_fits(59.0, 19.0), poses, look, *rest)
+    np.testing.assert_array_equal(score_px(found)[:, 0], fitting_px)
+
+
+@pytest.mark.parametrize(("fits", "kept"), [((0.3, 0.1), True), ((0.3, 0.05), False), ((0.05, 0.1), False)])
+def test_a_lost_jaw_that_fits_a_little_is_the_start_for_the_next_frame(monkeypatch, fits, kept):
+    start, better = (np.stack([np.eye(4), translation(np.array([0.0, down, 0.0]))]) for down in (0.0, -3.0))
+    one_way = region_tracker._DirectionTracker.__new__(region_tracker._DirectionTracker)
+    one_way._search = SimpleNamespace(config=SimpleNamespace(least_matched_px=0.0), objective_px=lambda solution: 0.0)
+    one_way._motion = MotionPredictor(start, np.zeros((2, 1, 3)))
+    one_way._found = np.array([True, False])
+    monkeypatch.setattr(region_tracker, "fitting_share", lambda solution: np.array(fits))
+    monkeypatch.setattr(region_tracker, "matched_px", lambda solution: np.full(2, 100.0))
+    monkeypatch.setattr(region_tracker, "_covariance", lambda solution: np.zeros((2, 6, 6)))
+    instant = SimpleNamespace(polished=lambda *_, **__: SimpleNamespace(poses=better))
+    given = one_way._taken(instant, None, True, np.full(2, 0.3), True)
+    assert not given.found[1]
+    np.testing.assert_allclose(one_way._motion.starts()[0][1], (better if kept else start)[1], atol=1e-12)
 
 
 @pytest.mark.parametrize(("found", "due"), [(True, [1, 2, 4, 8]), (False, [1, 2, 3, 4, 5, 6, 8])])

@@ -198,9 +198,12 @@ class PoseSearch:
         return solution
 
     def with_head_alone(self, solution: Solution, start: Array, look: InstantViews) -> Solution:
-        """Align the head alone if that improves its fit; a wrong jaw pose biases the head in a joint fit."""
+        """Align the head alone, then the jaw; a wrong jaw pose biases the head in a joint fit.
+
+        Returns the given solution if its head fits better.
+        """
         alone = self._align(start, look, FAR_GATES_PX, use=_upper_alone(look.views))
-        return max((solution, alone), key=lambda trial: float(fitting_share(trial)[0]))
+        return self._with_jaw(alone, look) if fitting_share(alone)[0] > fitting_share(solution)[0] else solution
 
     def with_head_searched(self, solution: Solution, predicted: Array, look: InstantViews, alone: bool) -> Solution:
         """Try shifted head poses with an unchanged jaw pose; with `alone`, the contour of the jaw is ignored."""
@@ -209,9 +212,17 @@ class PoseSearch:
         brief = [self._align(shifts[k] @ predicted, look, TRIAL_GATES_PX, True, use) for k in order]
         brief.sort(key=lambda trial: -float(score_px(trial)[0].sum()))
         best = [self._align(trial.poses, look, FAR_GATES_PX, True, use) for trial in brief[:_FINALISTS]]
-        if alone:
-            return max((solution, *best), key=lambda trial: float(score_px(trial)[0].sum()))
-        return max((solution, *best), key=self.objective_px)
+        if not alone:
+            return max((solution, *best), key=self.objective_px)
+        found = max((solution, *best), key=lambda trial: float(score_px(trial)[0].sum()))
+        return found if found is solution else self._with_jaw(found, look)
+
+    def _with_jaw(self, alone: Solution, look: InstantViews) -> Solution:
+        """Align both arches from an alignment of the head alone; return the better solution.
+
+        The contour of the jaw counts only in the joint fit, so a jaw that was followed well is not lost.
+        """
+        return self._better(alone, self.near(alone.poses, look, firm=True))
 
     def look(self, views: Sequence[View]) -> InstantViews:
         """Return the views of a frame with a shared rendering."""

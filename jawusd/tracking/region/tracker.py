@@ -217,13 +217,16 @@ class _DirectionTracker:
         solution = instant.polished(rough, firm=searched)
         share, least = fitting_share(rough), self._least()
         found = (share >= least * usual) & (matched_px(solution) >= self._search.config.least_matched_px)
-        poses = np.where(found[:, None, None], solution.poses, self._motion.predict())
+        # A lost jaw that fits a little keeps its pose as the start for the next frame, but is not found.
+        guessed = bool(found[0] and not found[1] and share[1] >= _LOST * usual[1])
+        kept = np.array([found[0], found[1] or guessed])
+        poses = np.where(kept[:, None, None], solution.poses, self._motion.predict())
         covariance = np.where(found[:, None, None], _covariance(solution), np.nan)
         if found.all():
             instant.learn(poses, RATES)
             self._search.condyles.learn(relative_pose(*poses), relative_covariance(poses[0], *covariance))
             self._usual.append(share)
-        self._motion.update(poses, found, np.full(2, seen))
+        self._motion.update(poses, found, np.full(2, seen), guessed)
         self._poses, self._found = poses, found
         objective_px = self._search.objective_px(solution)
         return RegionPose(poses, found, covariance, objective_px, solution, share / usual, least)
