@@ -23,7 +23,6 @@ from jawusd.tracking.contour.scan import CROWN, prepare_scan
 from jawusd.tracking.contour.views import Drawn
 from jawusd.tracking.performance.coordinates import Pose
 from jawusd.tracking.region import rig_tracker
-from jawusd.tracking.region import search as region_search
 from jawusd.tracking.region import tracker as region_tracker
 from jawusd.tracking.region.colours import BINS, PATCHES, TABLES, Areas, CameraColours, colour_bins
 from jawusd.tracking.region.creases import search_creases
@@ -343,12 +342,13 @@ def test_a_jaw_out_of_sight_is_searched_although_the_head_fits_less_than_usual(m
         with_head_alone=lambda *_: tried.append("head alone") or fits,
         with_head_searched=lambda *_: tried.append("head") or fits,
         with_jaw_searched=lambda *_: tried.append("jaw") or fits,
+        with_jaw=lambda solution, look, least: tried.append(f"both, if {least:.3f} of the jaw fits") or fits,
     )
     one_way = region_tracker._DirectionTracker.__new__(region_tracker._DirectionTracker)
     one_way._search, one_way._poses, one_way._motion, one_way._found = search, None, None, np.ones(2, bool)
     one_way._rest = one_way._absent = one_way._missed = 0
     one_way._located([None], None, np.array([0.33, 0.3]))
-    assert tried == ["head alone", "head", "jaw"]
+    assert tried == ["head alone", "head", "jaw", "both, if 0.075 of the jaw fits"]
 
 
 def solution_that_fits(upper_px, lower_px):
@@ -360,29 +360,19 @@ def solution_that_fits(upper_px, lower_px):
     )
 
 
-@pytest.mark.parametrize("step", ["with_head_alone", "with_head_searched"])
 @pytest.mark.parametrize(
-    ("alone_px", "joint_px", "fitting_px"),
+    ("both_px", "least", "fitting_px"),
     [
-        (61.0, (60.0, 20.0), (60.0, 20.0)),  # the head alone fits a little better, but the jaw fits as well
-        (61.0, (40.0, 10.0), (61.0, 0.0)),  # the jaw pulls the head away
-        (58.0, (60.0, 20.0), (59.0, 19.0)),  # the given solution's head fits better
+        ((60.0, 20.0), 0.1, (60.0, 20.0)),  # the head fits a little less, but the jaw as well
+        ((30.0, 20.0), 0.1, (61.0, 0.0)),  # less fits in total
+        ((60.0, 20.0), 0.3, (61.0, 0.0)),  # so little of the jaw fits that it is not found
     ],
 )
-def test_a_jaw_is_aligned_again_after_its_head_alone(monkeypatch, step, alone_px, joint_px, fitting_px):
+def test_a_jaw_counts_again_after_its_head_was_aligned_alone(monkeypatch, both_px, least, fitting_px):
     search = PoseSearch.__new__(PoseSearch)
-    search._axes, search._thin = np.eye(3), SimpleNamespace(scans=None)
     search.condyles = SimpleNamespace(strain=lambda relative: 0.0)
-
-    def align(start, look, gates, firm=False, use=None):
-        return solution_that_fits(*joint_px) if use is None else solution_that_fits(alone_px, 0.0)
-
-    monkeypatch.setattr(search, "_align", align)
-    monkeypatch.setattr(region_search, "rank_by_colour", lambda *_: [0])
-    monkeypatch.setattr(region_search, "_upper_alone", lambda views: np.array([[True], [False]]))
-    look, poses = InstantViews([], None), np.stack([np.eye(4)] * 2)
-    rest = (True,) if step == "with_head_searched" else ()
-    found = getattr(search, step)(solution_that_fits(59.0, 19.0), poses, look, *rest)
+    monkeypatch.setattr(search, "near", lambda *_, firm: solution_that_fits(*both_px))
+    found = search.with_jaw(solution_that_fits(61.0, 0.0), InstantViews([], None), least)
     np.testing.assert_array_equal(score_px(found)[:, 0], fitting_px)
 
 

@@ -198,12 +198,9 @@ class PoseSearch:
         return solution
 
     def with_head_alone(self, solution: Solution, start: Array, look: InstantViews) -> Solution:
-        """Align the head alone, then the jaw; a wrong jaw pose biases the head in a joint fit.
-
-        Returns the given solution if its head fits better.
-        """
+        """Align the head alone if that improves its fit; a wrong jaw pose biases the head in a joint fit."""
         alone = self._align(start, look, FAR_GATES_PX, use=_upper_alone(look.views))
-        return self._with_jaw(alone, look) if fitting_share(alone)[0] > fitting_share(solution)[0] else solution
+        return max((solution, alone), key=lambda trial: float(fitting_share(trial)[0]))
 
     def with_head_searched(self, solution: Solution, predicted: Array, look: InstantViews, alone: bool) -> Solution:
         """Try shifted head poses with an unchanged jaw pose; with `alone`, the contour of the jaw is ignored."""
@@ -212,17 +209,18 @@ class PoseSearch:
         brief = [self._align(shifts[k] @ predicted, look, TRIAL_GATES_PX, True, use) for k in order]
         brief.sort(key=lambda trial: -float(score_px(trial)[0].sum()))
         best = [self._align(trial.poses, look, FAR_GATES_PX, True, use) for trial in brief[:_FINALISTS]]
-        if not alone:
-            return max((solution, *best), key=self.objective_px)
-        found = max((solution, *best), key=lambda trial: float(score_px(trial)[0].sum()))
-        return found if found is solution else self._with_jaw(found, look)
+        if alone:
+            return max((solution, *best), key=lambda trial: float(score_px(trial)[0].sum()))
+        return max((solution, *best), key=self.objective_px)
 
-    def _with_jaw(self, alone: Solution, look: InstantViews) -> Solution:
-        """Align both arches from an alignment of the head alone; return the better solution.
+    def with_jaw(self, solution: Solution, look: InstantViews, least: float) -> Solution:
+        """Align both arches once more, since the head may have been aligned alone; return the better solution.
 
-        The contour of the jaw counts only in the joint fit, so a jaw that was followed well is not lost.
+        The given solution is kept if less than the fraction `least` of the jaw's contour fits: a jaw that is not found
+        biases the head.
         """
-        return self._better(alone, self.near(alone.poses, look, firm=True))
+        both = self.near(solution.poses, look, firm=True)
+        return self._better(solution, both) if fitting_share(both)[1] >= least else solution
 
     def look(self, views: Sequence[View]) -> InstantViews:
         """Return the views of a frame with a shared rendering."""

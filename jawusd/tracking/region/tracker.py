@@ -206,6 +206,8 @@ class _DirectionTracker:
         if _is_due(self._missed, self._found[1]):
             lost = not self._found[1]
             solution = search.with_jaw_searched(solution, starts[0], self._poses, look, self._motion, lost)
+        if searched:
+            solution = search.with_jaw(solution, look, self._least()[1] * usual[1])
         return solution, searched
 
     def _least(self) -> Array:
