@@ -49,7 +49,8 @@ _WIDE_MM = 40.0  # maximum expected opening of a jaw that was not visible [mm]
 class RegionPose:
     """Poses of both arches in one video frame."""
 
-    poses: Array  # T_world_upper and T_world_lower, shape (2, 4, 4); predictions for arches not found
+    # T_world_upper and T_world_lower, shape (2, 4, 4); of an arch not found, the pose that the next frame starts from
+    poses: Array
     found: Mask  # whether each arch was found, shape (2,)
     covariance: Array  # covariance of the poses' left twists about the world origin, NaN if not found, shape (2, 6, 6)
     objective_px: float = 0.0  # objective [px]: matched contour of both arches minus a penalty for implausible condyles
