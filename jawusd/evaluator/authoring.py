@@ -92,10 +92,10 @@ class RigAuthoring(RigArrays):
             d_keys: Jaw parameters [mm] at the keys, shape (K, 3).
             at: Query times, any shape; before the first key and after the last one, d is constant.
             method: "linear" for straight lines in d as in the paper, or "smooth" for a C1 curve, monotone between keys.
-            tangents: Slopes of the smooth curve at the keys [mm per unit of time], shape (K, 3); NaN and None: those
-                with which it is monotone between keys. Lines do not use them.
             inside: Where the smooth curve between two valid keys would leave the bound, follow the bound instead; the
                 curve is then only continuous. See `keep_inside` for keys outside the bound.
+            tangents: Slopes of the smooth curve at the keys [mm per unit of time], shape (K, 3); NaN and None: those
+                with which it is monotone between keys. Lines do not use them.
 
         Returns:
             Jaw parameters [mm], shape (*at.shape, 3).

@@ -133,8 +133,6 @@ def select(source: Source, anatomy: SubjectAnatomy) -> Selection:
 def select_tracks(tracks: Tracks, anatomy: SubjectAnatomy) -> Selection:
     """Select the frames of a take that can train a model: those measured without a prior and with a small covariance.
 
-    Raises like `select_poses`.
-
     Raises:
         FittingError: there are too few frames, or there is no motion.
     """
