@@ -27,6 +27,11 @@ def remap(image: NDArray[_Pixel], positions: NDArray[np.float32]) -> NDArray[_Pi
     return np.asarray(found, image.dtype)
 
 
+def shrunk(image: NDArray[np.uint8], size_px: tuple[int, int]) -> NDArray[np.uint8]:
+    """Return an image reduced to a width and height [px]; each pixel is the mean of the area that it covers."""
+    return np.asarray(cv2.resize(image, size_px, interpolation=cv2.INTER_AREA), np.uint8)
+
+
 def _needed(picture: DecodedPicture, positions: NDArray[np.float32]) -> NDArray[np.uint8]:
     """Convert only the bounding box of positions (h, w, 2) [px]; the rest is black and takes no memory."""
     sides = np.concatenate([positions[0], positions[-1], positions[:, 0], positions[:, -1]])
@@ -136,10 +141,7 @@ class WorkingView:
         n, (rows, cols) = self._samples, window
         part = self._map[rows.start * n : rows.stop * n, cols.start * n : cols.stop * n]
         fine = remap(image if isinstance(image, np.ndarray) else _needed(image, part), part)
-        if n == 1:
-            return fine
-        size = (cols.stop - cols.start, rows.stop - rows.start)
-        return np.asarray(cv2.resize(fine, size, interpolation=cv2.INTER_AREA), np.uint8)
+        return fine if n == 1 else shrunk(fine, (cols.stop - cols.start, rows.stop - rows.start))
 
     def _window(self, mask: NDArray[np.uint8]) -> Slices | None:
         """Return the window of working pixels that may sample a non-black mask pixel, or None if there are none."""

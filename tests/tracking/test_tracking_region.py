@@ -5,9 +5,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from jawusd.geometry import Camera
 from jawusd.tracking.contour.samples import COLUMNS, INVERSE_DEPTH, LENGTH, NX, NY, U, V, X, Y
 from jawusd.tracking.contour.scan import CROWN
 from jawusd.tracking.contour.views import Drawn
+from jawusd.tracking.region.appearance import Picture
 from jawusd.tracking.region.colours import BINS, PATCHES, TABLES, Areas, CameraColours, colour_bins
 from jawusd.tracking.region.creases import search_creases
 from jawusd.tracking.region.edges import _light, search_borders, sharpen
@@ -30,6 +32,21 @@ def disc(seed=0, noise=4.0, radius=RADIUS):
 def test_colours_share_a_bin_if_their_upper_four_bits_agree():
     picture = np.array([[[0, 0, 0], [15, 15, 15], [255, 255, 255], [16, 0, 0], [0, 16, 0], [0, 0, 16]]], np.uint8)
     assert colour_bins(picture).tolist() == [[0, 0, BINS - 1, 256, 16, 1]]
+
+
+@pytest.mark.parametrize("cut", [0, 1])
+def test_halved_pictures_show_a_point_at_half_the_position(cut):
+    """The disc's middle and area are those of its projection, for even and odd image sizes."""
+    K = np.array([[300.0, 0, MIDDLE], [0, 300.0, MIDDLE], [0, 0, 1]])
+    picture = disc(noise=0.0)[0][: SIZE - cut, : SIZE - cut]
+    camera = Camera("cam", picture.shape[1::-1], K, np.zeros(0), np.eye(4))
+    halved = Picture(camera, picture).halved()
+    assert halved.rgb.shape[1::-1] == halved.camera.size_px == (SIZE // 2 - cut, SIZE // 2 - cut)
+    bright = (halved.rgb[..., 1] - LIP[1]) / (TOOTH[1] - LIP[1])
+    y, x = np.mgrid[0 : SIZE // 2 - cut, 0 : SIZE // 2 - cut]
+    middle = np.array([(bright * x).sum(), (bright * y).sum()]) / bright.sum()
+    np.testing.assert_allclose(middle, halved.camera.project_pinhole(np.array([[0, 0, 100.0]]))[0], atol=0.03)
+    assert np.sqrt(bright.sum() / np.pi) == pytest.approx(RADIUS * halved.camera.K[0, 0] / 300.0, abs=0.05)
 
 
 def samples_at(radius):

@@ -17,7 +17,8 @@ from jawusd.tracking.contour.scan import ARCHES, Scan
 from jawusd.tracking.contour.views import View
 
 _AROUND_PX = 24  # margin rendered around the window [px], since the window moves with the masks
-_LARGEST_ZOOM = 1.02  # maximum change of scale for which a drawing is warped instead of rendered again
+# Maximum change of scale for which a drawing is warped instead of rendered again, per pixel of parallax allowed [1/px].
+_ZOOM_PER_PX = 0.01
 _MOST_KEPT = 64  # maximum number of drawings in the cache; every correction of the camera poses adds new ones
 
 _Kept = tuple[Array, int]
@@ -68,7 +69,7 @@ class Drawing:
         far = np.linalg.norm(before), np.linalg.norm(now)
         px_per_mm = _px_per_mm(matrix, centre)
         zoom = px_per_mm / self._px_per_mm
-        if max(zoom, 1.0 / zoom) > _LARGEST_ZOOM:
+        if max(zoom, 1.0 / zoom) > 1.0 + _ZOOM_PER_PX * parallax_px:
             return False
         turned_rad = np.linalg.norm(before / far[0] - now / far[1])
         if turned_rad * radius_mm * px_per_mm > parallax_px:

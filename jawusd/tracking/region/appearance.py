@@ -14,6 +14,7 @@ from scipy.ndimage import distance_transform_edt
 
 from jawusd.base.arrays import Array
 from jawusd.geometry import Camera
+from jawusd.media.working_view import shrunk
 from jawusd.tracking.contour.scan import ARCHES, CROWN, GUM, Scan
 from jawusd.tracking.contour.views import View
 from jawusd.tracking.region.colours import PATCHES, Areas, CameraColours, colour_bins
@@ -35,6 +36,11 @@ class Picture(NamedTuple):
 
     camera: Camera  # pinhole camera of this part of the image
     rgb: NDArray[np.uint8]  # 8-bit pixels, shape (h, w, 3)
+
+    def halved(self) -> Picture:
+        """Return the image at half the resolution."""
+        camera = self.camera.scaled((max(1, self.rgb.shape[1] // 2), max(1, self.rgb.shape[0] // 2)))
+        return Picture(camera, shrunk(self.rgb, camera.size_px))
 
 
 #: Function that returns the images of a frame, one per camera (None without image), cropped around the teeth at
@@ -110,6 +116,11 @@ class LearnedColours:
             view = View(camera.projection_matrix(), camera.centre_world(), empty, present, habits=habits, edges=edges)
             out.append(view)
         return out
+
+    def coarse_views(self, pictures: Sequence[Picture | None], before: Array) -> list[View]:
+        """Return the views of a video frame at half the resolution; the arguments are those of `views`."""
+        halves = [None if picture is None else picture.halved() for picture in pictures]
+        return [replace(view, habits=view.habits * [0.5, 0.5, 1.0]) for view in self.views(halves, before)]
 
     def counting(self, views: Sequence[View]) -> list[View]:
         """Return the views with empty counts, which collect the colours on both sides of borders for `learn`."""

@@ -30,6 +30,9 @@ class Effort:
 #: Residual gates of an alignment that starts from the prediction, and of one that starts from a more distant pose [px].
 NEAR_GATES_PX, FAR_GATES_PX = (6.0, 4.0, 3.0, 2.5, 2.0), (12.0, 8.0, 6.0, 4.0, 3.0, 2.5, 2.0)
 
+#: Residual gates of the short alignments by which a search compares starts [px].
+TRIAL_GATES_PX = (8.0, 6.0)
+
 #: Effort for recorded images.
 THOROUGH = Effort(
     gates_px=NEAR_GATES_PX,

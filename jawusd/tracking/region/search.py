@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
-from dataclasses import replace
-from typing import NamedTuple
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -19,7 +19,7 @@ from jawusd.tracking.contour.scan import Scan, thinned
 from jawusd.tracking.contour.solver import ContourSolver
 from jawusd.tracking.contour.views import View, present_masks
 from jawusd.tracking.region.appearance import CORRELATION_PX
-from jawusd.tracking.region.effort import FAR_GATES_PX, NEAR_GATES_PX
+from jawusd.tracking.region.effort import FAR_GATES_PX, NEAR_GATES_PX, TRIAL_GATES_PX
 from jawusd.tracking.region.jaw_priors import BiteTerm, CondyleMotion, CondyleTerm
 from jawusd.tracking.region.view import RegionView
 from jawusd.tracking.sequence.history import MotionPredictor
@@ -49,10 +49,13 @@ _SHIFTS_MM = [
     *((0.0, far, 0.0) for far in _FAR_MM),
 ]
 
-# Residual gates of the short trial alignments of a search [px]. Residual gate of the final step, which uses all faces
-# of the scans [px]. Spacing of contour samples [px]. Image motion after which the scans are rendered again [px].
-TRIAL_GATES_PX, LAST_GATES_PX, SAMPLE_STEP_PX, REDRAW_PX = (8.0, 6.0), (2.0,), 2.0, 2.0
-FACES = 6_000  # number of crown faces of the scans before the final step
+# Residual gate of the final step, which uses all faces of the scans [px]. Spacing of contour samples [px]. Image motion
+# after which the scans are rendered again [px].
+LAST_GATES_PX, SAMPLE_STEP_PX, REDRAW_PX = (2.0,), 2.0, 2.0
+_PARALLAX_PX = 4.0  # parallax within a scan up to which its rendering is warped [px]; rendering takes most of the time
+_COARSE = 0.5  # resolution of the images in a search, as a fraction of the usual one
+# Number of crown faces of the scans before the final step, and of those of a search, which has half the resolution.
+FACES, _COARSE_FACES = 6_000, 2_000
 # The usual matched contour is the median over the last `USUAL_FRAMES` frames, but at least `LEAST_USUAL` times that of
 # the first frame, so that slowly closing lips do not redefine it. Below a fraction `AGAIN` of it, a lost arch stays
 # lost.
@@ -117,11 +120,18 @@ def rank_by_colour(
     return [int(k) for k in np.argsort(-scores, kind="stable")]
 
 
-class InstantViews(NamedTuple):
+@dataclass(eq=False)
+class InstantViews:
     """Views of a video frame, and the rendering shared by all alignments of that frame."""
 
     views: Sequence[View]
     rendering: Rendering
+    halve: Callable[[], InstantViews]  # returns the frame at half the resolution
+
+    @cached_property
+    def coarse(self) -> InstantViews:
+        """The frame at half the resolution."""
+        return self.halve()
 
 
 class PoseSearch:
@@ -140,12 +150,21 @@ class PoseSearch:
             config or TrackingConfig(),
             sample_step_px=SAMPLE_STEP_PX,
             redraw_px=REDRAW_PX,
+            parallax_px=_PARALLAX_PX,
         )
         self.solver = ContourSolver([replace(scan, thin=None) for scan in scans], self.config, executor)
         self._thin = ContourSolver([thinned(scan, FACES) for scan in scans], self.config, executor)
         self.condyles = CondyleMotion(landmarks, axes)
         self._loose, self._firm = (CondyleTerm(self.condyles, noise) for noise in (_LOOSE_PX3, _FIRM_PX3))
         self._bite, self._axes = BiteTerm(landmarks[:3], axes[1], BORDER_PX3), axes
+        noise_px3 = _COARSE**3 * self.config.typical_noise_px3
+        coarse = replace(
+            self.config.with_gates_scaled(_COARSE), redraw_px=_COARSE * REDRAW_PX, typical_noise_px3=noise_px3
+        )
+        self._coarse = ContourSolver([thinned(scan, _COARSE_FACES) for scan in scans], coarse, executor)
+        self._coarse_terms = tuple(
+            replace(term, noise_px3=_COARSE**3 * term.noise_px3) for term in (self._firm, self._bite)
+        )
 
     def near(self, start: Array, look: InstantViews, *, firm: bool = False) -> Solution:
         """Align from T_world_upper and T_world_lower (2, 4, 4) that are accurate to a few tenths of a millimetre.
@@ -191,8 +210,8 @@ class PoseSearch:
         for jaws, count in ((near, _HOPEFUL_NEAR if everywhere else _HOPEFUL), (anywhere, _HOPEFUL)):
             order = rank_by_colour([head @ jaw for jaw in jaws], look.views, self._thin.scans, 1)[:count]
             pairs += [np.stack([head, head @ jaws[k]]) for k in order]
-        brief = [self._align(pair, look, TRIAL_GATES_PX, True) for pair in pairs]
-        brief.sort(key=lambda trial: -self.objective_px(trial))
+        brief = [self._tried(pair, look) for pair in pairs]
+        brief.sort(key=lambda trial: -self.objective_px(trial, 1.0 / _COARSE))
         for trial in brief[:_FINALISTS]:
             solution = self._better(solution, self.near(trial.poses, look, firm=True))
         return solution
@@ -206,7 +225,7 @@ class PoseSearch:
         """Try shifted head poses with an unchanged jaw pose; with `alone`, the contour of the jaw is ignored."""
         shifts, use = head_shifts(predicted[0], self._axes), _upper_alone(look.views) if alone else None
         order = rank_by_colour(list(shifts @ predicted[0]), look.views, self._thin.scans, 0)[: _HOPEFUL // 2]
-        brief = [self._align(shifts[k] @ predicted, look, TRIAL_GATES_PX, True, use) for k in order]
+        brief = [self._tried(shifts[k] @ predicted, look, use) for k in order]
         brief.sort(key=lambda trial: -float(score_px(trial)[0].sum()))
         best = [self._align(trial.poses, look, FAR_GATES_PX, True, use) for trial in brief[:_FINALISTS]]
         if alone:
@@ -222,22 +241,37 @@ class PoseSearch:
         both = self.near(solution.poses, look, firm=True)
         return self._better(solution, both) if fitting_share(both)[1] >= least else solution
 
-    def look(self, views: Sequence[View]) -> InstantViews:
-        """Return the views of a frame with a shared rendering."""
-        return InstantViews(views, self._thin.rendering(views))
+    def look(self, views: Sequence[View], coarse: Callable[[], Sequence[View]]) -> InstantViews:
+        """Return the views of a frame with a shared rendering; `coarse` returns the views at half the resolution."""
+
+        def halve() -> InstantViews:
+            views = coarse()
+            return InstantViews(views, self._coarse.rendering(views), halve)
+
+        return InstantViews(views, self._thin.rendering(views), halve)
 
     def polished(self, solution: Solution, views: Sequence[View], look: InstantViews, *, firm: bool) -> Solution:
         """Refine an alignment with all faces of the scans; visibility is not recomputed."""
         terms = (self._firm if firm else self._loose, self._bite)
         return self.solver.solve(solution.poses, views, LAST_GATES_PX, None, terms, rendering=look.rendering)
 
-    def objective_px(self, solution: Solution) -> float:
-        """Return the objective: matched contour minus a penalty for implausible condyles [px]."""
-        return float(score_px(solution).sum()) - _STRAIN_PX * self.condyles.strain(relative_pose(*solution.poses))
+    def objective_px(self, solution: Solution, px: float = 1.0) -> float:
+        """Return the objective: matched contour minus a penalty for implausible condyles [px].
+
+        Args:
+            px: size of a pixel of the solution's images [px].
+        """
+        return px * float(score_px(solution).sum()) - _STRAIN_PX * self.condyles.strain(relative_pose(*solution.poses))
 
     def _better(self, one: Solution, other: Solution) -> Solution:
         """Return the solution with the higher objective."""
         return other if self.objective_px(other) > self.objective_px(one) else one
+
+    def _tried(self, start: Array, look: InstantViews, use: Mask | None = None) -> Solution:
+        """Align briefly at half the resolution."""
+        gates = tuple(_COARSE * gate for gate in TRIAL_GATES_PX)
+        views, rendering = look.coarse.views, look.coarse.rendering
+        return self._coarse.solve(start, views, gates, use, self._coarse_terms, rendering=rendering)
 
     def _align(
         self,

@@ -6,6 +6,7 @@ from collections import deque
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 
@@ -102,7 +103,7 @@ class RegionTracker:
             landmarks, axes: as in `CondyleMotion`.
         """
         self._search = PoseSearch(scans, landmarks, axes, config, executor)
-        self._colours = LearnedColours(scans, cameras, axes)
+        self._colours = self._latest = LearnedColours(scans, cameras, axes)
         self._first_share, self.first_fit = np.zeros(2), 0.0
 
     def begin(self, cut: Cut, poses: Array) -> RegionPose:
@@ -120,24 +121,23 @@ class RegionTracker:
         return RegionPose(poses, np.ones(2, bool), _covariance(solution), objective_px, solution)
 
     def views(self, pictures: Sequence[Picture | None], poses: Array) -> list[View]:
-        """Return the views of a frame, with the colours learned so far.
+        """Return the views of a frame, with the colours of the last frame that was followed.
 
         Args:
             pictures: one image per camera.
             poses: T_world_upper and T_world_lower in that frame, shape (2, 4, 4).
         """
-        return self._colours.views(pictures, poses)
+        return self._latest.views(pictures, poses)
 
     def follow(self, cuts: Iterator[Cut], poses: Array) -> Iterator[RegionPose]:
         """Yield the poses of consecutive frames, forwards or backwards from a first frame with given poses.
 
         Every call starts from the colours learned in `begin`.
         """
-        known, self._colours = self._colours, self._colours.copy()
-        try:
-            yield from _DirectionTracker(self._search, self._colours, self._first_share, poses).follow(cuts)
-        finally:
-            self._colours = known
+        colours = self._colours.copy()
+        for found in _DirectionTracker(self._search, colours, self._first_share, poses).follow(cuts):
+            self._latest = colours
+            yield found
 
 
 class _Instant:
@@ -147,7 +147,7 @@ class _Instant:
         self, search: PoseSearch, colours: LearnedColours, pictures: Sequence[Picture | None], before: Array
     ) -> None:
         self._search, self._colours, self._pictures = search, colours, pictures
-        self.look = search.look(colours.views(pictures, before))
+        self.look = search.look(colours.views(pictures, before), partial(colours.coarse_views, pictures, before))
         self._counting = colours.counting(self.look.views)
 
     def polished(self, solution: Solution, *, firm: bool = False) -> Solution:
