@@ -6,9 +6,10 @@ A timeline maps evenly spaced frames to the images of a video, whose presentatio
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,21 @@ from numpy.typing import NDArray
 from jawusd.base.arrays import Array
 from jawusd.base.errors import CaptureError
 from jawusd.media.pixels import Colour, ColourPicture
+
+T = TypeVar("T")
+
+
+def read_backwards(frames: range, read: Callable[[range], Iterable[T]], first: int, most: int) -> Iterator[T]:
+    """Yield what is read of a descending range; it is read forwards, in chunks of `first` to `most` frames.
+
+    Chunks grow, since often only a few frames are needed.
+    """
+    start, count = 0, first
+    while start < len(frames):
+        held = list(read(frames[start : start + count][::-1]))
+        while held:
+            yield held.pop()
+        start, count = start + count, min(2 * count, most)
 
 
 class Timeline:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import TypeAlias
 
@@ -12,12 +13,14 @@ from numpy.typing import NDArray
 
 from jawusd.base.arrays import Array, Mask
 from jawusd.geometry import Camera
-from jawusd.media.clip import Clip
+from jawusd.media.clip import Clip, read_backwards
 from jawusd.media.pixels import ColourPicture
 from jawusd.media.working_view import WorkingView, remap
 
 _NODE_PX = 8  # spacing of the grid on which the undistortion map is computed
-_CHUNK = 16  # number of frames that are buffered when reading backwards; 50 MB per full HD camera
+# First and largest number of frames that are buffered when reading backwards, and number of frames that are kept after
+# reading. 16 frames take 50 MB per full HD camera.
+_FIRST_CHUNK, _CHUNK, _KEPT = 2, 16, 6
 
 Pictures: TypeAlias = "dict[str, ColourPicture | None]"
 _Frames = range  # alias of the built-in type, because a class below has a method `range`
@@ -95,6 +98,7 @@ class ColourFootage:
     def __init__(self, videos: Mapping[str, Clip], offsets: Mapping[str, int]) -> None:
         """Open the videos; `offsets` are reference frame number minus own frame number, by camera name."""
         self._videos, self._offsets = dict(videos), dict(offsets)
+        self._latest: dict[int, Pictures] = {}  # the images read last, by frame
 
     def own(self, name: str, frame: int) -> int | None:
         """Return a camera's image index at a frame of the reference camera; None if the camera has no image there."""
@@ -117,20 +121,35 @@ class ColourFootage:
     def walk(self, frames: _Frames) -> Iterator[tuple[int, Pictures]]:
         """Yield frame numbers with their images; descending ranges are read forwards in chunks.
 
+        The images read last are kept, since trackers often go back by a few frames.
+
         Raises:
             CaptureError: an image cannot be decoded.
         """
-        if frames.step > 0:
-            yield from self._forwards(frames)
-            return
-        for start in range(0, len(frames), _CHUNK):
-            part = frames[start : start + _CHUNK]
-            held = list(self._forwards(part[::-1]))
-            while held:
-                yield held.pop()
+        start = 0
+        while start < len(frames) and frames[start] in self._latest:
+            yield frames[start], self._latest[frames[start]]
+            start += 1
+        rest = frames[start:]
+        for frame, pictures in (
+            self._forwards(rest) if frames.step > 0 else read_backwards(rest, self._forwards, _FIRST_CHUNK, _CHUNK)
+        ):
+            self._latest[frame] = pictures
+            while len(self._latest) > _KEPT:
+                del self._latest[next(iter(self._latest))]
+            yield frame, pictures
 
     def _forwards(self, frames: _Frames) -> Iterator[tuple[int, Pictures]]:
         wanted = {name: [self.own(name, frame) for frame in frames] for name in self._videos}
         readers = {name: self._videos[name].colour_pictures(own) for name, own in wanted.items()}
-        for frame in frames:
-            yield frame, {name: next(reader) for name, reader in readers.items()}
+
+        def read() -> Pictures:
+            return {name: next(reader) for name, reader in readers.items()}
+
+        with ThreadPoolExecutor(1) as ahead:  # decodes the next images while the caller works
+            coming = [ahead.submit(read)] if len(frames) else []
+            for k, frame in enumerate(frames):
+                pictures = coming.pop().result()
+                if k + 1 < len(frames):
+                    coming.append(ahead.submit(read))
+                yield frame, pictures

@@ -44,7 +44,7 @@ class Begin(Generic[P]):
     frame: int
     pose: P
     #: yields the poses of frames in tracking order, next to a given pose; each call starts with the colours of the
-    #: first frame
+    #: first frame, also while an earlier call is in use
     follow: Callable[[range, P], Iterator[P]]
 
 
@@ -58,6 +58,7 @@ class TwoWays(Generic[P]):
     margin: float = 1.0  # ratio of these lengths above which another pose replaces a trusted one
     #: second difference of the motion of the lower teeth above which earlier frames are followed again [mm]
     jump_mm: float = _JUMP_MM
+    at_once: bool = False  # whether earlier frames are followed again at once, while their images are in memory
     patience: int = 1  # number of successive lost frames without a newly found arch after which tracking backwards ends
     #: called with the number of frames followed and the total
     progress: Callable[[int, int], None] = lambda done, total: None
@@ -71,12 +72,20 @@ class TwoWays(Generic[P]):
         self.known[begin.frame] = begin.pose
         self.progress(1, len(self.frames))
         for way in both_ways(begin.frame, self.frames):
-            for frame, pose in zip(way, begin.follow(way, begin.pose), strict=True):
+            for k, (frame, pose) in enumerate(zip(way, begin.follow(way, begin.pose), strict=True)):
                 self.known[frame] = pose
                 self.progress(len(self.known), len(self.frames))
-            for frame in self._turning_points(way):
-                before = range(frame - way.step, begin.frame, -way.step)
-                self.replace(before, begin.follow(before, self.known[frame]))
+                if self.at_once:
+                    self._follow_back(begin, way, k)
+            if not self.at_once:
+                for k in range(len(way)):
+                    self._follow_back(begin, way, k)
+
+    def _follow_back(self, begin: Begin[P], way: range, k: int) -> None:
+        """Follow the teeth from frame `way[k]` back to the first one if earlier poses may be wrong."""
+        if self._is_turning_point(way, k):
+            before = way[:k][::-1]
+            self.replace(before, begin.follow(before, self.known[way[k]]))
 
     def recover(
         self,
@@ -201,13 +210,12 @@ class TwoWays(Generic[P]):
                 return
             yield frame, away_mm
 
-    def _turning_points(self, way: range) -> Iterator[int]:
-        """Yield the frames that are trusted more than the one before, or where the jaw accelerates implausibly."""
-        for k in range(1, len(way)):
-            jumps = k > 1 and self._bend_mm(way[k - 2 : k + 1]) > self.jump_mm
-            pose, last = self.known[way[k]], self.known[way[k - 1]]
-            if jumps or trust(pose) > trust(last):
-                yield way[k]
+    def _is_turning_point(self, way: range, k: int) -> bool:
+        """Return whether frame `way[k]` is trusted more than the one before, or the jaw accelerates implausibly."""
+        if k == 0:
+            return False
+        pose, last = self.known[way[k]], self.known[way[k - 1]]
+        return trust(pose) > trust(last) or (k > 1 and self._bend_mm(way[k - 2 : k + 1]) > self.jump_mm)
 
     def _apart_mm(self, one: P, other: P) -> float:
         """Return the mean distance between the lower teeth at two poses of a frame [mm]."""

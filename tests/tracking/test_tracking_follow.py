@@ -186,6 +186,21 @@ def test_teeth_are_followed_back_from_where_they_were_found(step):
     assert not lost_stretches(known.known, FRAMES, 1)
 
 
+@pytest.mark.parametrize("at_once", [False, True])
+def test_frames_are_followed_back_at_the_end_or_while_their_images_are_in_memory(at_once):
+    """Lost from 12 to 14: the frames before 15 are read after 29, or right after 15."""
+    read = []
+
+    def follow(way, pose):
+        for frame in way:
+            read.append(frame)
+            yield Pose(float(frame), pose.value != 10.0 or frame not in (12, 13, 14))
+
+    of_frames(at_once=at_once).follow(Begin(10, Pose(10.0), follow))
+    again = [14, 13, 12, 11]
+    assert read == [*range(11, 16), *again, *range(16, 30)] if at_once else [*range(11, 30), *again]
+
+
 def test_a_jaw_that_jumps_is_followed_back():
     """Wrong from 18 to 21: the poses that jump are followed back, and the correct ones replace the wrong ones."""
     tracker = Tracker({frame: Pose(frame + 2.0, fit=0.5) for frame in range(18, 22)}, 10)

@@ -80,3 +80,21 @@ def test_footage_is_read_by_time(take):
                 else:
                     assert np.asarray(image).mean() == pytest.approx(40 + 5 * own, abs=1.5)
                     assert footage.own(camera.name, frame) == own_frames(camera.name).index(own)
+
+
+def test_footage_just_read_is_not_decoded_again(take, monkeypatch):
+    videos = {camera.name: Video(take / f"{camera.name}.mp4") for camera in CAMERAS}
+    footage, decoded = ColourFootage(videos, OFFSETS), []
+    seen = dict(footage.walk(range(FIRST, FIRST + COUNT)))
+    forwards = ColourFootage._forwards
+
+    def recorded(self, frames):
+        decoded.extend(frames)
+        return forwards(self, frames)
+
+    monkeypatch.setattr(ColourFootage, "_forwards", recorded)
+    again = dict(footage.walk(range(FIRST + COUNT - 2, FIRST - 1, -1)))
+    assert list(again) == list(range(FIRST + COUNT - 2, FIRST - 1, -1)) and decoded == [FIRST, FIRST + 1]
+    for frame, pictures in again.items():
+        for name, picture in pictures.items():
+            assert np.array_equal(np.asarray(picture), np.asarray(seen[frame][name]))

@@ -15,6 +15,7 @@ from jawusd.base.errors import TrackingError
 from jawusd.formats.capture import CameraSource
 from jawusd.formats.finding import Finding
 from jawusd.geometry import Camera
+from jawusd.media.clip import read_backwards
 from jawusd.media.mask_survey import ARCHES, odd_pictures, survey_masks
 from jawusd.media.masks import FrameMasks, MaskReader, open_masks
 from jawusd.media.working_view import WorkingView
@@ -30,9 +31,8 @@ MaskSource: TypeAlias = CameraSource | FrameMasks
 AnySource = TypeVar("AnySource", bound=MaskSource)
 
 _BORDER_PX = 20  # margin of a view around the masks [px]: more than the widest search
-# Number of frames buffered when iterating backwards, at most (about 20 MB), and at first, since frames are often
-# followed back for a few frames only.
-_CHUNK, _FIRST_CHUNK = 48, 3
+# First and largest number of frames that are buffered when reading backwards; 48 take about 20 MB.
+_FIRST_CHUNK, _CHUNK = 3, 48
 
 
 class EdgeSearch(Protocol):
@@ -155,17 +155,12 @@ class MaskViews:
 
     def walk(self, first: int, stop: int, step: int = 1) -> Iterator[tuple[int, list[View]]]:
         """Yield the frames of a range with their views; with step -1 in reverse, though masks are read forwards."""
-        if step > 0:
-            for frame in range(first, stop):
-                yield frame, self.at(frame)
-            return
-        end, size = first + 1, _FIRST_CHUNK
-        while end > stop + 1:
-            begin = max(end - size, stop + 1)
-            chunk = [(frame, self.at(frame)) for frame in range(begin, end)]
-            while chunk:
-                yield chunk.pop()
-            end, size = begin, min(2 * size, _CHUNK)
+
+        def read(frames: range) -> Iterator[tuple[int, list[View]]]:
+            return ((frame, self.at(frame)) for frame in frames)
+
+        frames = range(first, stop, step)
+        yield from read(frames) if step > 0 else read_backwards(frames, read, _FIRST_CHUNK, _CHUNK)
 
 
 def masked_frames(offsets: Sequence[int], readers: Sequence[Sequence[MaskReader]]) -> tuple[int, int]:

@@ -201,7 +201,7 @@ class PictureTake:
         def search(lost: range, near: FrameFit) -> Begin[FrameFit]:
             return self._begin(cameras, head, *self._shot.find(lost, near.pose.head[:3, :3] @ self._axes[1]))
 
-        take = TwoWays(frames, self._places, _fitting_px, _CLEARLY, progress=progress)
+        take = TwoWays(frames, self._places, _fitting_px, _CLEARLY, at_once=True, progress=progress)
         begin = self._begin(cameras, head, *start)
         take.follow(begin)
         if recover:
