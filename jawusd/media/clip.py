@@ -18,13 +18,17 @@ from jawusd.base.arrays import Array
 from jawusd.base.errors import CaptureError
 from jawusd.media.pixels import Colour, ColourPicture
 
-T = TypeVar("T")
+_Item = TypeVar("_Item")
 
 
-def read_backwards(frames: range, read: Callable[[range], Iterable[T]], first: int, most: int) -> Iterator[T]:
-    """Yield what is read of a descending range; it is read forwards, in chunks of `first` to `most` frames.
+def read_backwards(frames: range, read: Callable[[range], Iterable[_Item]], first: int, most: int) -> Iterator[_Item]:
+    """Yield the items of a descending range of frames, which are read forwards in chunks.
 
-    Chunks grow, since often only a few frames are needed.
+    Args:
+        frames: the range, in steps of -1.
+        read: returns the items of an ascending range, one per frame.
+        first, most: number of frames in the first chunk, and maximum number. Each chunk is twice as long as the one
+            before, since often only a few frames are needed.
     """
     start, count = 0, first
     while start < len(frames):

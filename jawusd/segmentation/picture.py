@@ -131,9 +131,8 @@ class ColourFootage:
             yield frames[start], self._latest[frames[start]]
             start += 1
         rest = frames[start:]
-        for frame, pictures in (
-            self._forwards(rest) if frames.step > 0 else read_backwards(rest, self._forwards, _FIRST_CHUNK, _CHUNK)
-        ):
+        backwards = read_backwards(rest, self._forwards, _FIRST_CHUNK, _CHUNK)
+        for frame, pictures in self._forwards(rest) if frames.step > 0 else backwards:
             self._latest[frame] = pictures
             while len(self._latest) > _KEPT:
                 del self._latest[next(iter(self._latest))]

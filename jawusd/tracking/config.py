@@ -56,6 +56,8 @@ class TrackingConfig:
     redraw_px: float = 1.0
     # Parallax within a scan above which it is rendered again, not warped [px]; see docs/explanation/constants.md.
     parallax_px: float = 2.0
+    # Change of scale up to which it is warped [-], in either direction.
+    largest_zoom: float = 1.02
     prediction_mm: float = 0.5  # standard deviation of an arch about its predicted position [mm]: a weak prior
     # Outline variance times correlation length of drawn masks [px^3]: (0.4 px)^2 times 18 px.
     typical_noise_px3: float = 3.0

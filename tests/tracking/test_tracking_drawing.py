@@ -20,7 +20,6 @@ SCANS = tuple(prepare_scan(mesh, name) for mesh, name in zip(MESHES, ("upper", "
 CAMERA = make_cameras()[1]
 POSE = jaw_poses(3)[2][0]
 SHAPE = CAMERA.size_px[::-1]
-PARALLAX_PX = TrackingConfig().parallax_px
 
 
 def seen(pose):
@@ -97,7 +96,7 @@ def test_another_viewpoint_is_drawn_again():
     drawing = Drawing(SCANS[0], *seen(POSE), SHAPE)
 
     def shows(pose, shape=SHAPE):
-        return drawing.shows(*seen(pose), shape, PARALLAX_PX)
+        return drawing.shows(*seen(pose), shape, TrackingConfig())
 
     assert shows(POSE) and shows(moved(sideways_mm=1.0, roll_rad=0.02))
     assert not shows(moved(turn_rad=0.1))  # other sides are seen
@@ -128,7 +127,7 @@ def test_drawings_are_reused_at_the_next_instant():
 
 
 def test_drawings_of_removed_cameras_are_dropped():
-    drawings = Drawings(SCANS, PARALLAX_PX)
+    drawings = Drawings(SCANS, TrackingConfig())
     for k in range(70):
         camera = CAMERA.centre_world() + [1e-3 * k, 0, 0]
         drawings.of(0, 0, camera, POSE, seen(POSE)[0], (8, 8))

@@ -35,12 +35,12 @@ def test_colours_share_a_bin_if_their_upper_four_bits_agree():
 
 
 @pytest.mark.parametrize("cut", [0, 1])
-def test_halved_pictures_show_a_point_at_half_the_position(cut):
+def test_coarse_pictures_show_a_point_at_half_the_position(cut):
     """The disc's middle and area are those of its projection, for even and odd image sizes."""
     K = np.array([[300.0, 0, MIDDLE], [0, 300.0, MIDDLE], [0, 0, 1]])
     picture = disc(noise=0.0)[0][: SIZE - cut, : SIZE - cut]
     camera = Camera("cam", picture.shape[1::-1], K, np.zeros(0), np.eye(4))
-    halved = Picture(camera, picture).halved()
+    halved = Picture(camera, picture).coarse()
     assert halved.rgb.shape[1::-1] == halved.camera.size_px == (SIZE // 2 - cut, SIZE // 2 - cut)
     bright = (halved.rgb[..., 1] - LIP[1]) / (TOOTH[1] - LIP[1])
     y, x = np.mgrid[0 : SIZE // 2 - cut, 0 : SIZE // 2 - cut]

@@ -70,13 +70,13 @@ def test_the_example_is_followed_by_its_colours(tmp_path):
     cameras, videos = open_footage(capture)
     start = capture.bootstrap.frame
     picked = GuidedTracker(*teeth, lambda *_: [], 1).picked(capture.bootstrap, cameras)
-    chosen = range(max(start - 2, int(frames[0])), start + 6)
+    chosen = range(max(start - 2, int(frames[0])), start + 9)
     done = []
     footage, subject = Counted(videos, offsets), subject_of_capture(capture, meshes)
     follower = Follower(footage, cameras, prepared(teeth), subject)
     assert follower.start_at(start, picked)[1] > 0.3
     guide = follower.run(chosen, NotSearched, lambda *step: done.append(step))
-    assert 1 <= footage.most <= 7  # otherwise long takes exhaust the memory
+    assert 1 <= footage.most <= 6  # of 8 frames; otherwise long takes exhaust the memory
     assert sorted(guide) == list(chosen) and done[-1] == ("follow", len(chosen), len(chosen))
     for frame, found in guide.items():
         true = poses[list(frames).index(frame)]

@@ -11,14 +11,12 @@ from numpy.typing import NDArray
 
 from jawusd.base.arrays import Array
 from jawusd.media.working_view import warp_nearest
-from jawusd.tracking.config import Mapper
+from jawusd.tracking.config import Mapper, TrackingConfig
 from jawusd.tracking.contour.samples import COLUMNS, INVERSE_DEPTH, NX, NY, U, V, X, Y, Z, contour_samples, pixel
 from jawusd.tracking.contour.scan import ARCHES, Scan
 from jawusd.tracking.contour.views import View
 
 _AROUND_PX = 24  # margin rendered around the window [px], since the window moves with the masks
-# Maximum change of scale for which a drawing is warped instead of rendered again, per pixel of parallax allowed [1/px].
-_ZOOM_PER_PX = 0.01
 _MOST_KEPT = 64  # maximum number of drawings in the cache; every correction of the camera poses adds new ones
 
 _Kept = tuple[Array, int]
@@ -59,20 +57,20 @@ class Drawing:
         # pseudo-inverse that fits affine maps to the motion of the drawn points, shape (3, n)
         self._least_squares = np.linalg.pinv(drawn_at)
 
-    def shows(self, matrix: Array, eye: Array, shape: tuple[int, int], parallax_px: float) -> bool:
+    def shows(self, matrix: Array, eye: Array, shape: tuple[int, int], limits: TrackingConfig) -> bool:
         """Return whether this drawing can be warped to another pose; arguments are as for the constructor.
 
-        `parallax_px` is the maximum relative motion of near and far parts.
+        `limits` has the maximum relative motion of near and far parts, and the maximum change of scale.
         """
         centre, radius_mm = self._scan.centre, self._scan.radius_mm
         before, now = self._eye - centre, eye - centre
         far = np.linalg.norm(before), np.linalg.norm(now)
         px_per_mm = _px_per_mm(matrix, centre)
         zoom = px_per_mm / self._px_per_mm
-        if max(zoom, 1.0 / zoom) > 1.0 + _ZOOM_PER_PX * parallax_px:
+        if max(zoom, 1.0 / zoom) > limits.largest_zoom:
             return False
         turned_rad = np.linalg.norm(before / far[0] - now / far[1])
-        if turned_rad * radius_mm * px_per_mm > parallax_px:
+        if turned_rad * radius_mm * px_per_mm > limits.parallax_px:
             return False
         to_drawn = self.to_drawn(matrix)
         height, width = shape
@@ -122,9 +120,9 @@ class Drawing:
 class Drawings:
     """A cache of the last drawings of every arch in every camera."""
 
-    def __init__(self, scans: Sequence[Scan], parallax_px: float) -> None:
-        """Start with an empty cache; `parallax_px` is as for `Drawing.shows`."""
-        self._scans, self._parallax_px = scans, parallax_px
+    def __init__(self, scans: Sequence[Scan], limits: TrackingConfig) -> None:
+        """Start with an empty cache; `limits` are as for `Drawing.shows`."""
+        self._scans, self._limits = scans, limits
         self._kept: dict[tuple[int, int, bytes], Drawing] = {}
 
     def of(
@@ -138,7 +136,7 @@ class Drawings:
         eye = T_world_scan[:3, :3].T @ (camera - T_world_scan[:3, 3])
         key = (arch, view, camera.tobytes())
         kept = self._kept.get(key)
-        if kept is None or not kept.shows(matrix, eye, shape, self._parallax_px):
+        if kept is None or not kept.shows(matrix, eye, shape, self._limits):
             kept = self._kept[key] = Drawing(self._scans[arch], matrix, eye, shape)
         return kept
 

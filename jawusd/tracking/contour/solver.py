@@ -64,7 +64,7 @@ class ContourSolver:
         self.thin = ContourSolver(thin, config, executor) if any(scan.thin for scan in self.scans) else None
         self._executor = executor
         #: Cache of the last drawings of both scans.
-        self.drawings = Drawings(self.scans, config.parallax_px)
+        self.drawings = Drawings(self.scans, config)
 
     @cached_property
     def rough(self) -> ContourSolver:

@@ -29,6 +29,8 @@ RATES, FIRST_RATES = (0.1, 0.2), (0.5, 0.5)
 _GUM_RATE, _MOST_GUM_PX = 0.1, 2.0  # learning rate [-] and maximum [px] of the gum-line offset
 #: Correlation length of border errors along the contour [px]: lips and shadows affect whole teeth.
 CORRELATION_PX = 110.0
+#: Resolution of the images in a search, as a fraction of the usual one [-].
+COARSE = 0.5
 
 
 class Picture(NamedTuple):
@@ -37,10 +39,10 @@ class Picture(NamedTuple):
     camera: Camera  # pinhole camera of this part of the image
     rgb: NDArray[np.uint8]  # 8-bit pixels, shape (h, w, 3)
 
-    def halved(self) -> Picture:
-        """Return the image at half the resolution."""
-        camera = self.camera.scaled((max(1, self.rgb.shape[1] // 2), max(1, self.rgb.shape[0] // 2)))
-        return Picture(camera, shrunk(self.rgb, camera.size_px))
+    def coarse(self) -> Picture:
+        """Return the image at the resolution of a search."""
+        height, width = (max(1, int(COARSE * side)) for side in self.rgb.shape[:2])
+        return Picture(self.camera.scaled((width, height)), shrunk(self.rgb, (width, height)))
 
 
 #: Function that returns the images of a frame, one per camera (None without image), cropped around the teeth at
@@ -118,9 +120,9 @@ class LearnedColours:
         return out
 
     def coarse_views(self, pictures: Sequence[Picture | None], before: Array) -> list[View]:
-        """Return the views of a video frame at half the resolution; the arguments are those of `views`."""
-        halves = [None if picture is None else picture.halved() for picture in pictures]
-        return [replace(view, habits=view.habits * [0.5, 0.5, 1.0]) for view in self.views(halves, before)]
+        """Return the views of a video frame at the resolution of a search; the arguments are those of `views`."""
+        reduced = [None if picture is None else picture.coarse() for picture in pictures]
+        return [replace(view, habits=view.habits * [COARSE, COARSE, 1.0]) for view in self.views(reduced, before)]
 
     def counting(self, views: Sequence[View]) -> list[View]:
         """Return the views with empty counts, which collect the colours on both sides of borders for `learn`."""

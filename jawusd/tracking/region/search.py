@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import replace
+from functools import cache
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,7 +19,7 @@ from jawusd.tracking.contour.rendering import Rendering
 from jawusd.tracking.contour.scan import Scan, thinned
 from jawusd.tracking.contour.solver import ContourSolver
 from jawusd.tracking.contour.views import View, present_masks
-from jawusd.tracking.region.appearance import CORRELATION_PX
+from jawusd.tracking.region.appearance import COARSE, CORRELATION_PX
 from jawusd.tracking.region.effort import FAR_GATES_PX, NEAR_GATES_PX, TRIAL_GATES_PX
 from jawusd.tracking.region.jaw_priors import BiteTerm, CondyleMotion, CondyleTerm
 from jawusd.tracking.region.view import RegionView
@@ -52,9 +53,10 @@ _SHIFTS_MM = [
 # Residual gate of the final step, which uses all faces of the scans [px]. Spacing of contour samples [px]. Image motion
 # after which the scans are rendered again [px].
 LAST_GATES_PX, SAMPLE_STEP_PX, REDRAW_PX = (2.0,), 2.0, 2.0
-_PARALLAX_PX = 4.0  # parallax within a scan up to which its rendering is warped [px]; rendering takes most of the time
-_COARSE = 0.5  # resolution of the images in a search, as a fraction of the usual one
-# Number of crown faces of the scans before the final step, and of those of a search, which has half the resolution.
+# Parallax within a scan [px] and change of scale [-] up to which its rendering is warped; rendering takes most of the
+# time.
+_PARALLAX_PX, _ZOOM = 4.0, 1.04
+# Number of crown faces of the scans before the final step, and in a search, in images of lower resolution.
 FACES, _COARSE_FACES = 6_000, 2_000
 # The usual matched contour is the median over the last `USUAL_FRAMES` frames, but at least `LEAST_USUAL` times that of
 # the first frame, so that slowly closing lips do not redefine it. Below a fraction `AGAIN` of it, a lost arch stays
@@ -120,18 +122,12 @@ def rank_by_colour(
     return [int(k) for k in np.argsort(-scores, kind="stable")]
 
 
-@dataclass(eq=False)
-class InstantViews:
+class InstantViews(NamedTuple):
     """Views of a video frame, and the rendering shared by all alignments of that frame."""
 
     views: Sequence[View]
     rendering: Rendering
-    halve: Callable[[], InstantViews]  # returns the frame at half the resolution
-
-    @cached_property
-    def coarse(self) -> InstantViews:
-        """The frame at half the resolution."""
-        return self.halve()
+    coarse: Callable[[], tuple[Sequence[View], Rendering]]  # returns both at the resolution of a search
 
 
 class PoseSearch:
@@ -151,19 +147,22 @@ class PoseSearch:
             sample_step_px=SAMPLE_STEP_PX,
             redraw_px=REDRAW_PX,
             parallax_px=_PARALLAX_PX,
+            largest_zoom=_ZOOM,
         )
         self.solver = ContourSolver([replace(scan, thin=None) for scan in scans], self.config, executor)
         self._thin = ContourSolver([thinned(scan, FACES) for scan in scans], self.config, executor)
         self.condyles = CondyleMotion(landmarks, axes)
         self._loose, self._firm = (CondyleTerm(self.condyles, noise) for noise in (_LOOSE_PX3, _FIRM_PX3))
         self._bite, self._axes = BiteTerm(landmarks[:3], axes[1], BORDER_PX3), axes
-        noise_px3 = _COARSE**3 * self.config.typical_noise_px3
+        # A variance times a length scales with the third power [px^3].
         coarse = replace(
-            self.config.with_gates_scaled(_COARSE), redraw_px=_COARSE * REDRAW_PX, typical_noise_px3=noise_px3
+            self.config.with_gates_scaled(COARSE),
+            redraw_px=COARSE * REDRAW_PX,
+            typical_noise_px3=COARSE**3 * self.config.typical_noise_px3,
         )
         self._coarse = ContourSolver([thinned(scan, _COARSE_FACES) for scan in scans], coarse, executor)
         self._coarse_terms = tuple(
-            replace(term, noise_px3=_COARSE**3 * term.noise_px3) for term in (self._firm, self._bite)
+            replace(term, noise_px3=COARSE**3 * term.noise_px3) for term in (self._firm, self._bite)
         )
 
     def near(self, start: Array, look: InstantViews, *, firm: bool = False) -> Solution:
@@ -210,8 +209,8 @@ class PoseSearch:
         for jaws, count in ((near, _HOPEFUL_NEAR if everywhere else _HOPEFUL), (anywhere, _HOPEFUL)):
             order = rank_by_colour([head @ jaw for jaw in jaws], look.views, self._thin.scans, 1)[:count]
             pairs += [np.stack([head, head @ jaws[k]]) for k in order]
-        brief = [self._tried(pair, look) for pair in pairs]
-        brief.sort(key=lambda trial: -self.objective_px(trial, 1.0 / _COARSE))
+        brief = [self._trial(pair, look) for pair in pairs]
+        brief.sort(key=lambda trial: -self.objective_px(trial, 1.0 / COARSE))
         for trial in brief[:_FINALISTS]:
             solution = self._better(solution, self.near(trial.poses, look, firm=True))
         return solution
@@ -225,7 +224,7 @@ class PoseSearch:
         """Try shifted head poses with an unchanged jaw pose; with `alone`, the contour of the jaw is ignored."""
         shifts, use = head_shifts(predicted[0], self._axes), _upper_alone(look.views) if alone else None
         order = rank_by_colour(list(shifts @ predicted[0]), look.views, self._thin.scans, 0)[: _HOPEFUL // 2]
-        brief = [self._tried(shifts[k] @ predicted, look, use) for k in order]
+        brief = [self._trial(shifts[k] @ predicted, look, use) for k in order]
         brief.sort(key=lambda trial: -float(score_px(trial)[0].sum()))
         best = [self._align(trial.poses, look, FAR_GATES_PX, True, use) for trial in brief[:_FINALISTS]]
         if alone:
@@ -241,14 +240,19 @@ class PoseSearch:
         both = self.near(solution.poses, look, firm=True)
         return self._better(solution, both) if fitting_share(both)[1] >= least else solution
 
-    def look(self, views: Sequence[View], coarse: Callable[[], Sequence[View]]) -> InstantViews:
-        """Return the views of a frame with a shared rendering; `coarse` returns the views at half the resolution."""
+    def look(self, views: Sequence[View], coarse_views: Callable[[], Sequence[View]]) -> InstantViews:
+        """Return the views of a frame with a shared rendering.
 
-        def halve() -> InstantViews:
-            views = coarse()
-            return InstantViews(views, self._coarse.rendering(views), halve)
+        Args:
+            coarse_views: returns the views at the resolution of a search; called at most once.
+        """
 
-        return InstantViews(views, self._thin.rendering(views), halve)
+        @cache
+        def coarse() -> tuple[Sequence[View], Rendering]:
+            views = coarse_views()
+            return views, self._coarse.rendering(views)
+
+        return InstantViews(views, self._thin.rendering(views), coarse)
 
     def polished(self, solution: Solution, views: Sequence[View], look: InstantViews, *, firm: bool) -> Solution:
         """Refine an alignment with all faces of the scans; visibility is not recomputed."""
@@ -259,7 +263,7 @@ class PoseSearch:
         """Return the objective: matched contour minus a penalty for implausible condyles [px].
 
         Args:
-            px: size of a pixel of the solution's images [px].
+            px: size of the pixels of the solution, in pixels of the usual resolution [-].
         """
         return px * float(score_px(solution).sum()) - _STRAIN_PX * self.condyles.strain(relative_pose(*solution.poses))
 
@@ -267,11 +271,11 @@ class PoseSearch:
         """Return the solution with the higher objective."""
         return other if self.objective_px(other) > self.objective_px(one) else one
 
-    def _tried(self, start: Array, look: InstantViews, use: Mask | None = None) -> Solution:
-        """Align briefly at half the resolution."""
-        gates = tuple(_COARSE * gate for gate in TRIAL_GATES_PX)
-        views, rendering = look.coarse.views, look.coarse.rendering
-        return self._coarse.solve(start, views, gates, use, self._coarse_terms, rendering=rendering)
+    def _trial(self, start: Array, look: InstantViews, use: Mask | None = None) -> Solution:
+        """Align in a few steps at the resolution of a search."""
+        gates_px = tuple(COARSE * gate for gate in TRIAL_GATES_PX)
+        views, rendering = look.coarse()
+        return self._coarse.solve(start, views, gates_px, use, self._coarse_terms, rendering=rendering)
 
     def _align(
         self,
