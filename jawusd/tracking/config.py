@@ -64,9 +64,13 @@ class TrackingConfig:
     # Assumed correlation length of outline errors along the contour [px], until it is measured on the take.
     correlation_px: float = 18.0
     known_correlation_px: float | None = None  # known correlation length of outline errors [px]; None: measured
+    # Spacing of the nodes of the field of smooth outline errors [px]; 0: errors are not assumed to be smooth. Ratio of the
+    # density of white outline noise to the variance of a node [px].
+    error_spacing_px: float = 15.0
+    error_prior_px: float = 2.0
     # Side of the tiles over which errors are summed to measure it [px]: estimates change little from 20 to 45.
     tile_px: int = 30
-    tile_factor: float = 2.2  # ratio of true to measured correlation length [-]: the fit absorbs part of the error
+    tile_factor: float = 1.5  # ratio of true to measured correlation length [-]: the fit absorbs part of the error
     history_frames: int = 31  # number of recent good frames that define the usual residual and coverage: about a second
     # Number of recent good frames that define the usual score: fewer than those in which lips close.
     score_frames: int = 7

@@ -11,7 +11,6 @@ from jawusd.tracking.contour.equations import OutlineSums
 from jawusd.tracking.contour.samples import (
     COLUMNS,
     EDGE_SHARE,
-    GUM_SHARE,
     INVERSE_DEPTH,
     LENGTH,
     NX,
@@ -23,7 +22,11 @@ from jawusd.tracking.contour.samples import (
     Z,
     pixel_of,
 )
+from jawusd.tracking.contour.smooth_errors import without_smooth_errors
 
+# Linear terms of a sample: derivative with respect to a twist (6), effects of annotator bias (tooth edge, gum line twice)
+# and distance to the edge.
+_GUM, _DISTANCE, _TERMS = 7, 9, 10
 _EDGE = 127.5  # mask value at the outline, where half of the pixel area belongs to the teeth
 
 
@@ -157,15 +160,67 @@ def accumulate(
             at the former, of samples deep inside the mask.
         where: scan to world (4, 4), world [mm] to homogeneous px (3, 4), centre of the twist in the world (3,) [mm].
     """
+    rows, weights, _ = _rows(samples, distances, limits, where, sums, r, c)
+    _add(rows, rows, weights, sums, r, c)
+
+
+@numba.njit(nogil=True, cache=True)
+def accumulate_final(
+    samples: Array,
+    distances: Array,
+    limits: tuple[float, float, float],
+    where: tuple[Array, Array, Array],
+    smooth: tuple[float, float],
+    tile_px: int,
+    sums: OutlineSums,
+    r: int,
+    c: int,
+) -> tuple[Array, Array]:
+    """Add normal equations without smooth outline errors to sums; return the scatter of the rest over image tiles.
+
+    The first result, shape (6, 6), is the sum of s s^T over the tiles, where s is the sum of w J d over the samples in
+    a tile. The second result uses the gum fraction instead of d: the effect of a gum line that is one pixel off in each
+    tile. Outline errors are correlated along the contour, so they are summed within a tile before they are squared. The
+    ratio of the result to the normal matrix gives the correlation length (cluster-robust covariance, Liang & Zeger
+    1986).
+
+    Args:
+        samples, distances, limits, where: as for `accumulate`.
+        smooth: `spacing_px` and `prior_px` of `without_smooth_errors`; with a spacing of 0, no errors are removed.
+        tile_px: side of the square tiles, longer than the correlation length.
+    """
+    rows, weights, pixels = _rows(samples, distances, limits, where, sums, r, c)
+    rest = without_smooth_errors(rows, weights, pixels, *smooth) if smooth[0] > 0 else rows
+    _add(rows, rest, weights, sums, r, c)
+    across = int(pixels[:, 0].max() / tile_px) + 1 if len(pixels) else 0
+    down = int(pixels[:, 1].max() / tile_px) + 1 if len(pixels) else 0
+    scatter, gum = np.zeros((down * across, 6)), np.zeros((down * across, 6))
+    for s in range(len(rows)):
+        tile = int(pixels[s, 1] / tile_px) * across + int(pixels[s, 0] / tile_px)
+        for k in range(6):
+            scatter[tile, k] += weights[s] * rest[s, _DISTANCE] * rows[s, k]
+            gum[tile, k] += weights[s] * rest[s, _GUM] * rows[s, k]
+    return scatter.T @ scatter, gum.T @ gum
+
+
+@numba.njit(nogil=True, cache=True)
+def _rows(
+    samples: Array,
+    distances: Array,
+    limits: tuple[float, float, float],
+    where: tuple[Array, Array, Array],
+    sums: OutlineSums,
+    r: int,
+    c: int,
+) -> tuple[Array, Array, Array]:
+    """Return the linear terms (n, 10), weights (n,) and pixels (n, 2) of the samples within the gate; add the lengths.
+
+    The terms of a sample are its derivative with respect to the twist, the effects of annotator bias, and its distance.
+    """
     gate_px, score_gate_px, pull = limits
     pose, matrix, centre = where
-    precision, gradient = sums.precision[r, c], sums.gradient[r, c]
-    habit_slope, habit_distance, habit_weight = (
-        sums.habit_slope[r, c],
-        sums.habit_distance[r, c],
-        sums.habit_weight[r, c],
-    )
-    jacobian = np.empty(6)
+    rows, weights, pixels = np.empty((len(samples), _TERMS)), np.empty(len(samples)), np.empty((len(samples), 2))
+    n = 0
     for s in range(len(samples)):
         d = distances[s]
         if np.isnan(d):
@@ -185,62 +240,35 @@ def accumulate(
                 continue
             weight = e * e
             sums.matched_px[r, c] += sample[LENGTH]
-        weight *= sample[LENGTH]
-        _slope(sample, pose, matrix, centre, jacobian)
-        for i in range(6):
-            for k in range(6):
-                precision[i, k] += weight * jacobian[i] * jacobian[k]
-            gradient[i] += weight * jacobian[i] * d
+        weights[n] = weight * sample[LENGTH]
+        pixels[n, 0], pixels[n, 1] = max(sample[U], 0.0), max(sample[V], 0.0)
+        _slope(sample, pose, matrix, centre, rows[n])
         for a in range(COLUMNS - EDGE_SHARE):
-            habit = weight * sample[EDGE_SHARE + a]
-            if habit != 0.0:
-                for i in range(6):
-                    habit_slope[a, i] += habit * jacobian[i]
-                habit_distance[a] += habit * d
-                for b in range(COLUMNS - EDGE_SHARE):
-                    habit_weight[a, b] += habit * sample[EDGE_SHARE + b]
-        sums.weight[r, c] += weight
-        sums.square[r, c] += weight * d * d
+            rows[n, 6 + a] = sample[EDGE_SHARE + a]
+        rows[n, _DISTANCE] = d
+        n += 1
+    return rows[:n], weights[:n], pixels[:n]
 
 
 @numba.njit(nogil=True, cache=True)
-def scatter_of_tiles(
-    samples: Array,
-    distances: Array,
-    gate_px: float,
-    pose: Array,
-    matrix: Array,
-    centre: Array,
-    shape: tuple[int, int],
-    tile_px: int,
-) -> tuple[Array, Array]:
-    """Return the sum of s s^T over image tiles, shape (6, 6), where s is the sum of w J d over the samples in a tile.
-
-    The second result uses the gum fraction instead of d: the effect of a gum line that is one pixel off in each tile.
-
-    Outline errors are correlated along the contour, so they are summed within a tile before they are squared. The ratio
-    of the result to the normal matrix gives the correlation length (cluster-robust covariance, Liang & Zeger 1986).
-
-    Args:
-        samples, distances, pose, matrix, centre: as for `accumulate`.
-        gate_px: residual above which the Tukey weight is zero.
-        shape: (h, w) of the image.
-        tile_px: side of the square tiles, longer than the correlation length.
-    """
-    across = shape[1] // tile_px + 1
-    sums = np.zeros(((shape[0] // tile_px + 1) * across, 6))
-    gum = np.zeros_like(sums)
-    jacobian = np.empty(6)
-    for s in range(len(samples)):
-        d = distances[s]
-        if not abs(d) < gate_px:
-            continue
-        sample = samples[s]
-        weight = (1.0 - (d / gate_px) ** 2) ** 2 * sample[LENGTH]
-        _slope(sample, pose, matrix, centre, jacobian)
-        row, column = min(max(int(sample[V]), 0), shape[0] - 1), min(max(int(sample[U]), 0), shape[1] - 1)
-        tile = row // tile_px * across + column // tile_px
-        for k in range(6):
-            sums[tile, k] += weight * d * jacobian[k]
-            gum[tile, k] += weight * sample[GUM_SHARE] * jacobian[k]
-    return sums.T @ sums, gum.T @ gum
+def _add(rows: Array, rest: Array, weights: Array, sums: OutlineSums, r: int, c: int) -> None:
+    """Add the sums of weighted products of the samples' terms, `rows`, with the terms without smooth errors, `rest`."""
+    matrix = np.zeros((_TERMS, _TERMS))
+    weight = square = 0.0
+    for s in range(len(rows)):
+        w = weights[s]
+        for i in range(_TERMS):
+            for k in range(i + 1):
+                matrix[i, k] += w * rows[s, i] * rest[s, k]
+        weight += w
+        square += w * rest[s, _DISTANCE] ** 2
+    for i in range(_TERMS):
+        for k in range(i):
+            matrix[k, i] = matrix[i, k]
+    sums.precision[r, c] += matrix[:6, :6]
+    sums.gradient[r, c] += matrix[:6, _DISTANCE]
+    sums.habit_slope[r, c] += matrix[6:_DISTANCE, :6]
+    sums.habit_distance[r, c] += matrix[6:_DISTANCE, _DISTANCE]
+    sums.habit_weight[r, c] += matrix[6:_DISTANCE, 6:_DISTANCE]
+    sums.weight[r, c] += weight
+    sums.square[r, c] += square

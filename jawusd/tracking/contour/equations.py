@@ -39,6 +39,8 @@ class OutlineSums(NamedTuple):
 
     Annotator bias has three components: at tooth edges [px], at the gum line in the image [px], and at the gum line
     along the crown surface [mm]. It shifts the outline by their scalar product with h, the last columns of a sample.
+    At the end of an alignment with masks, smooth outline errors are eliminated from the sums; `square` then refers to
+    the rest of the distances (see `smooth_errors`).
     """
 
     precision: Array  # sum w J^T J, shape (2, C, 6, 6)
@@ -57,28 +59,18 @@ class OutlineSums(NamedTuple):
         shapes: tuple[tuple[int, ...], ...] = ((6, 6), (6,), (3, 6), (3,), (3, 3), (), (), (), ())
         return cls(*(np.zeros((2, cameras, *shape)) for shape in shapes))
 
-    def plus(self, other: OutlineSums) -> OutlineSums:
-        """Return the sums over the samples of both operands."""
-        return OutlineSums(*(ours + theirs for ours, theirs in zip(self, other, strict=True)))
-
 
 @dataclass(frozen=True, eq=False)
 class Solution:
     """Poses with their linearised residuals: the state of an iteration, and the result of an alignment."""
 
     poses: Array  # T_world_upper and T_world_lower, shape (2, 4, 4)
-    silhouette: OutlineSums  # sums over the matched samples of silhouettes and borders of the scans
-    gingival_margin: OutlineSums  # sums over the matched samples of the crown-gum line
+    outline: OutlineSums  # sums over the matched samples of silhouettes, borders of the scans and crown-gum lines
     centres: Array  # centres of the twists in world coordinates [mm], shape (2, 3)
     scatters: Array  # first result of `scatter_of_tiles` (outline errors) per arch, summed over views, shape (2, 6, 6)
     gum_scatters: Array  # second result (gum-line errors) per arch, summed over views, shape (2, 6, 6)
     visible_px: Array  # contour length that could have been matched, per arch and view [px], shape (2, C)
     iterations: int  # number of linearised steps
-
-    @property
-    def outline(self) -> OutlineSums:
-        """The sums over all matched contour samples; computed on demand, since every frame stores its solution."""
-        return self.silhouette.plus(self.gingival_margin)
 
 
 class NormalEquations:
@@ -118,15 +110,12 @@ class ResidualTerm(Protocol):
         ...
 
 
-@dataclass(frozen=True)
 class OutlineTerm:
-    """Penalises the distances of crown silhouettes, or of crown-gum lines, from the edges of their masks."""
-
-    of_gum: bool
+    """Penalises the distances of visible contours from the edges of their masks."""
 
     def accumulate(self, state: Solution, equations: NormalEquations) -> None:
         """Add the sums over the matched samples of all views."""
-        sums = state.gingival_margin if self.of_gum else state.silhouette
+        sums = state.outline
         for arch, weight in enumerate(equations.outline_weight):
             equations.add(arch, weight * sums.precision[arch].sum(0), weight * sums.gradient[arch].sum(0))
 

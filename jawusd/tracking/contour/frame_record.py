@@ -169,9 +169,7 @@ def _packed(record: FrameRecord) -> tuple[Array, NDArray[np.float32]]:
         solution.poses, solution.centres, solution.visible_px, record.status, record.used, record.coverage,
         [(float(loss.reason), loss.value, loss.limit) for loss in losses], [solution.iterations],
     )  # fmt: skip
-    sums = []
-    for outline in (solution.silhouette, solution.gingival_margin):
-        sums += [outline.precision[..., _LOWER[0], _LOWER[1]], *outline[1:]]
+    sums = [solution.outline.precision[..., _LOWER[0], _LOWER[1]], *solution.outline[1:]]
     sums += [matrix[:, _LOWER[0], _LOWER[1]] for matrix in (solution.scatters, solution.gum_scatters)]
     return _joined(figures), _joined(sums).astype(np.float32)
 
@@ -182,12 +180,12 @@ def _unpacked(figures: Array, sums: NDArray[np.float32]) -> FrameRecord:
     views = (len(figures) - 2 * 16 - 2 * 3 - 2 - 2 * 3 - 1) // (2 * 3)
     shapes = ((2, 4, 4), (2, 3), (2, views), (2,), (2, views), (2, views), (2, 3), (1,))
     poses, centres, visible, status, used, coverage, losses, iterations = _split(figures, shapes)
-    half, count = (len(_LOWER[0]),), len(_SUM_SHAPES)
+    half = (len(_LOWER[0]),)
     of_views = [(2, views, *shape) for shape in (half, *_SUM_SHAPES[1:])]
-    parts = _split(sums.astype(np.float64), (*of_views, *of_views, (2, *half), (2, *half)))
-    silhouette, margin = (OutlineSums(parts[k][..., _MIRROR], *parts[k + 1 : k + count]) for k in (0, count))
-    scatters, gum_scatters = (part[:, _MIRROR] for part in parts[-2:])
-    solution = Solution(poses, silhouette, margin, centres, scatters, gum_scatters, visible, int(iterations[0]))
+    precision, *others, scatters, gum_scatters = _split(sums.astype(np.float64), (*of_views, (2, *half), (2, *half)))
+    outline = OutlineSums(precision[..., _MIRROR], *others)
+    scatters, gum_scatters = (matrix[:, _MIRROR] for matrix in (scatters, gum_scatters))
+    solution = Solution(poses, outline, centres, scatters, gum_scatters, visible, int(iterations[0]))
     first, second = (Loss(LostReason(int(reason)), float(value), float(limit)) for reason, value, limit in losses)
     return FrameRecord(solution, status.astype(np.int8), used.astype(bool), coverage, (first, second))
 

@@ -23,33 +23,27 @@ _TUKEY_VARIANCE = 0.828
 
 def score_px(solution: Solution) -> Array:
     """Return the matched contour length, weighted by closeness, per arch and view [px], shape (2, C)."""
-    return solution.silhouette.score_px + solution.gingival_margin.score_px
+    return solution.outline.score_px
 
 
 def matched_px(solution: Solution) -> Array:
     """Return the matched contour length per arch [px], shape (2,)."""
-    return np.asarray((solution.silhouette.matched_px + solution.gingival_margin.matched_px).sum(1))
+    return np.asarray(solution.outline.matched_px.sum(1))
 
 
 def residual_px(solution: Solution) -> Array:
     """Return the standard deviation of the matched residuals per arch [px], shape (2,); NaN without matches."""
     with np.errstate(invalid="ignore", divide="ignore"):
-        weight, square = _weight_and_square(solution)
-        return np.sqrt(square.sum(1) / weight.sum(1) / _TUKEY_VARIANCE)
+        sums = solution.outline
+        return np.sqrt(sums.square.sum(1) / sums.weight.sum(1) / _TUKEY_VARIANCE)
 
 
 def view_residual_px(solution: Solution) -> Array:
     """Return the standard deviation of the residuals per arch and view [px], shape (2, C); NaN without matches."""
-    weight, square = _weight_and_square(solution)
-    out = np.full(weight.shape, np.nan)
-    np.divide(square, weight * _TUKEY_VARIANCE, out=out, where=weight > 0)
+    sums = solution.outline
+    out = np.full(sums.weight.shape, np.nan)
+    np.divide(sums.square, sums.weight * _TUKEY_VARIANCE, out=out, where=sums.weight > 0)
     return np.sqrt(out)
-
-
-def _weight_and_square(solution: Solution) -> tuple[Array, Array]:
-    """Return the sums `weight` and `square` over all matched samples, without computing the other sums."""
-    edge, gum = solution.silhouette, solution.gingival_margin
-    return edge.weight + gum.weight, edge.square + gum.square
 
 
 def uncovered_px(

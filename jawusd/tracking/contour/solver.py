@@ -15,7 +15,7 @@ import numpy as np
 from jawusd.base.arrays import Array, Mask
 from jawusd.geometry import bite_normal, orthonormalise, transform_point
 from jawusd.tracking.config import Item, Mapper, Result, TrackingConfig
-from jawusd.tracking.contour.correspondences import accumulate, scatter_of_tiles, search_edges
+from jawusd.tracking.contour.correspondences import accumulate, accumulate_final, search_edges
 from jawusd.tracking.contour.equations import (
     NormalEquations,
     OutlineSums,
@@ -33,8 +33,8 @@ from jawusd.tracking.contour.views import Drawn, View, present_masks
 _ROUGH_FACES = 6_000  # number of crown faces of an arch in short trials: a third of that of a decimated scan
 _DENSE_STEPS = 2  # number of steps with all faces of a dense scan, after the decimated scan has converged
 
-# Samples, number of silhouette samples, distances to the mask edge, visible contour length [px].
-_Match = tuple[Array, int, Array, float]
+# Samples, distances to the mask edge, visible contour length [px].
+_Match = tuple[Array, Array, float]
 
 
 class Matched(NamedTuple):
@@ -111,30 +111,58 @@ class ContourSolver:
             rendering: rendering of these views by this solver, shared with other alignments.
         """
         use = present_masks(views) if use is None else use
-        start, earlier, left = poses, 0, tuple(gates_px)
-        if self.thin is not None and left:
-            rough = self.thin.solve(poses, views, gates_px, use, terms, outline_weight)
-            poses, earlier, left = rough.poses, rough.iterations, left[-1:] * _DENSE_STEPS
-        poses = np.array(poses, np.float64)
         rendering = rendering or self.rendering(views)
-        pull = StartTerm(start, self._start_strength)
-        all_terms: tuple[ResidualTerm, ...] = (OutlineTerm(False), OutlineTerm(True), pull, *terms)
+        pull = StartTerm(poses, self._start_strength)
+        given = (views, use, rendering, (OutlineTerm(), pull, *terms), outline_weight)
+        poses, iterations = self._converged(poses, tuple(gates_px), *given)
+        gate = gates_px[-1] if gates_px else self.config.final_gate_px[1]
+        state = self.linearise(poses, views, use, gate, rendering, final=True)
+        if gates_px and self._removes_smooth_errors(views, gate):
+            # From the least-squares solution, one step of generalised least squares is enough (Le Cam's one-step
+            # estimator; van der Vaart 1998, section 5.7). From farther away, it would be slower.
+            poses, _ = self._moved(poses, state, *given[3:])
+            state = self.linearise(poses, views, use, gate, rendering, final=True)
+        return replace(state, iterations=iterations)
+
+    def _converged(
+        self,
+        poses: Array,
+        gates_px: tuple[float, ...],
+        views: Sequence[View],
+        use: Mask,
+        rendering: Rendering,
+        terms: Sequence[ResidualTerm],
+        outline_weight: Array | None,
+    ) -> tuple[Array, int]:
+        """Return the least-squares solution, shape (2, 4, 4), and the number of steps; arguments are as for `solve`."""
+        earlier, left = 0, gates_px
+        if self.thin is not None and left:
+            given = (views, use, self.thin.rendering(views), terms, outline_weight)
+            poses, earlier = self.thin._converged(poses, left, *given)
+            left = left[-1:] * _DENSE_STEPS
         iterations = 0
         while left:
             iterations += 1
             state = self.linearise(poses, views, use, left[0], rendering)
-            equations = NormalEquations(outline_weight)
-            for term in all_terms:
-                term.accumulate(state, equations)
-            step = equations.solve()
-            for r in ARCHES:
-                poses[r] = motion_about(state.centres[r], step[r]) @ poses[r]
-            left = self.config.gates_after(left, self._motion_mm(step))
-        if iterations:  # prevent rounding errors from accumulating, since predictions multiply poses frame after frame
-            poses = orthonormalise(poses)
-        gate = gates_px[-1] if gates_px else self.config.final_gate_px[1]
-        state = self.linearise(poses, views, use, gate, rendering, final=True)
-        return replace(state, iterations=earlier + iterations)
+            poses, moved_mm = self._moved(poses, state, terms, outline_weight)
+            left = self.config.gates_after(left, moved_mm)
+        return poses, earlier + iterations
+
+    def _moved(
+        self, poses: Array, state: Solution, terms: Sequence[ResidualTerm], outline_weight: Array | None
+    ) -> tuple[Array, float]:
+        """Return the poses after a Gauss-Newton step, and an upper bound on the motion of crown vertices [mm]."""
+        equations = NormalEquations(outline_weight)
+        for term in terms:
+            term.accumulate(state, equations)
+        step = equations.solve()
+        moved = [motion_about(state.centres[r], step[r]) @ poses[r] for r in ARCHES]
+        # Predictions multiply poses frame after frame, so rounding errors would accumulate.
+        return orthonormalise(np.stack(moved)), self._motion_mm(step)
+
+    def _removes_smooth_errors(self, views: Sequence[View], gate_px: float) -> bool:
+        narrow = gate_px <= self.config.final_gate_px[1]
+        return narrow and self.config.error_spacing_px > 0 and all(view.edges is None for view in views)
 
     def linearise(
         self,
@@ -168,26 +196,27 @@ class ContourSolver:
         mapper = map if all(view.edges is None for view in views) else self.map
         matches = dict(zip(tasks, mapper(match, tasks), strict=True))
         centres = np.stack([transform_point(poses[r], self.scans[r].centre) for r in ARCHES])
-        silhouette, margin = OutlineSums.zeros(len(views)), OutlineSums.zeros(len(views))
+        outline = OutlineSums.zeros(len(views))
         scatters, gum_scatters, visible = np.zeros((2, 6, 6)), np.zeros((2, 6, 6)), np.zeros((2, len(views)))
         pull = config.pull if gate > config.pull_above_px else 0.0
         used = [gate, gate]
         if gate <= config.final_gate_px[1]:
-            used = [self._final_gate([matches[t][2] for t in tasks if t[0] == r], gate) for r in ARCHES]
+            used = [self._final_gate([matches[t][1] for t in tasks if t[0] == r], gate) for r in ARCHES]
         for r, c in tasks:
-            samples, count, distances, visible[r, c] = matches[r, c]
+            samples, distances, visible[r, c] = matches[r, c]
             if matched is not None:
                 matched.append(Matched(r, c, samples, distances, used[r]))
             where = (moved[r, c], views[c].matrix, centres[r])
             limits = (used[r], config.score_gate_px, pull)
-            accumulate(samples[:count], distances[:count], limits, where, silhouette, r, c)
-            accumulate(samples[count:], distances[count:], limits, where, margin, r, c)
             if final:
-                shape = views[c].masks.shape[1:]
-                own, gum = scatter_of_tiles(samples, distances, used[r], *where, shape, config.tile_px)
-                scatters[r] += own
-                gum_scatters[r] += gum
-        return Solution(poses.copy(), silhouette, margin, centres, scatters, gum_scatters, visible, 0)
+                spacing_px = config.error_spacing_px if self._removes_smooth_errors(views, gate) else 0.0
+                smooth = (spacing_px, config.error_prior_px)
+                last = accumulate_final(samples, distances, limits, where, smooth, config.tile_px, outline, r, c)
+                scatters[r] += last[0]
+                gum_scatters[r] += last[1]
+            else:
+                accumulate(samples, distances, limits, where, outline, r, c)
+        return Solution(poses.copy(), outline, centres, scatters, gum_scatters, visible, 0)
 
     def _match(self, pose: Array, view: View, r: int, rendering: Rendering, c: int, reach: float) -> _Match:
         config, depths = self.config, rendering.depths[c]
@@ -204,7 +233,7 @@ class ContourSolver:
             visible -= float(samples[hidden, LENGTH].sum())
             weights[hidden] = 0.0
             samples[:, LENGTH] *= weights
-        return samples, silhouettes, distances - samples[:, HABITS] @ view.habits[r], visible
+        return samples, distances - samples[:, HABITS] @ view.habits[r], visible
 
     def _final_gate(self, distances: list[Array], gate: float) -> float:
         """Return the Tukey gate for the spread of the residuals (median absolute deviation)."""

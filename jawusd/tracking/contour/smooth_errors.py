@@ -1,0 +1,65 @@
+"""Smooth errors of outlines as nuisance parameters.
+
+Whoever draws or segments teeth leaves the true outline for some millimetres at a time, so neighbouring samples have
+nearly the same error. Least squares treats samples as independent, and follows such errors wherever the contour is
+long. Here, the error is a smooth field over the image plus white noise: the field is interpolated bilinearly between
+nodes on a grid, whose values have a normal prior, and are eliminated from the normal equations (generalised least
+squares; Aitken 1936). What remains are differences over less than the node spacing, such as the two sides of a gap
+between teeth, in which smooth errors cancel.
+"""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+
+from jawusd.base.arrays import Array
+
+
+@numba.njit(nogil=True, cache=True)
+def without_smooth_errors(rows: Array, weights: Array, pixels: Array, spacing_px: float, prior_px: float) -> Array:
+    """Return the rows of samples minus their weighted least-squares fit by a smooth field.
+
+    For rows X, weights W, interpolation weights B and prior precision p, the result is X - B (B^T W B + p)^-1 B^T W X;
+    its product with W X is the matrix of generalised normal equations.
+
+    Args:
+        rows: linear terms of every sample, shape (n, m).
+        weights: weight of every sample [px], shape (n,).
+        pixels: position of every sample in the image [px], shape (n, 2), not negative.
+        spacing_px: distance between the nodes of the field.
+        prior_px: ratio of the density of the white noise [px^3] to the variance of a node [px^2].
+    """
+    count, terms = rows.shape
+    columns = int(pixels[:, 0].max() / spacing_px) + 2 if count else 0
+    lines = int(pixels[:, 1].max() / spacing_px) + 2 if count else 0
+    number = np.full(columns * lines, -1)  # index of every grid node among those that are used
+    nodes, shares, used = np.empty((count, 4), np.int64), np.empty((count, 4)), 0
+    for s in range(count):
+        x, y = pixels[s, 0] / spacing_px, pixels[s, 1] / spacing_px
+        i, j = int(x), int(y)
+        for k in range(4):
+            right, down = k % 2, k // 2
+            place = (j + down) * columns + i + right
+            if number[place] < 0:
+                number[place] = used
+                used += 1
+            nodes[s, k] = number[place]
+            shares[s, k] = abs(1 - right - (x - i)) * abs(1 - down - (y - j))
+    normal, right_sides = np.zeros((used, used)), np.zeros((used, terms))
+    for s in range(count):
+        for k in range(4):
+            share = weights[s] * shares[s, k]
+            for q in range(4):
+                normal[nodes[s, k], nodes[s, q]] += share * shares[s, q]
+            for t in range(terms):
+                right_sides[nodes[s, k], t] += share * rows[s, t]
+    for k in range(used):
+        normal[k, k] += prior_px
+    field = np.linalg.solve(normal, right_sides)
+    out = rows.copy()
+    for s in range(count):
+        for k in range(4):
+            for t in range(terms):
+                out[s, t] -= shares[s, k] * field[nodes[s, k], t]
+    return out
