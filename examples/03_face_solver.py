@@ -99,6 +99,7 @@ class Solver:
         turn = torch.zeros(count, 3, dtype=torch.float64, requires_grad=True)
         move = torch.zeros(count, 3, dtype=torch.float64, requires_grad=slides)
         unknowns = [turn, move] if slides else [turn]
+
         def pose() -> torch.Tensor:
             # Unknowns of one size, lever lengths and millimetres, make the search well scaled.
             same = torch.eye(4, dtype=torch.float64)

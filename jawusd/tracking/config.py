@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from typing import Protocol, TypeVar
+from typing import NamedTuple, Protocol, TypeVar
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -16,6 +16,15 @@ class Mapper(Protocol):
     def __call__(self, function: Callable[[Item], Result], items: Iterable[Item], /) -> Iterable[Result]:
         """Return the results in the order of the items."""
         ...
+
+
+class SmoothErrors(NamedTuple):
+    """Model of outline errors: a smooth field, interpolated between nodes on a grid, plus white noise."""
+
+    spacing_px: float = 15.0  # spacing of the nodes
+    prior_px: float = 2.0  # ratio of the density of the white noise [px^3] to the variance of a node [px^2]
+    # Factor on the remaining information [-]: variance times correlation length of all errors, over that of the noise.
+    gain: float = 2.5
 
 
 @dataclass(frozen=True)
@@ -64,10 +73,8 @@ class TrackingConfig:
     # Assumed correlation length of outline errors along the contour [px], until it is measured on the take.
     correlation_px: float = 18.0
     known_correlation_px: float | None = None  # known correlation length of outline errors [px]; None: measured
-    # Spacing of the nodes of the field of smooth outline errors [px]; 0: errors are not assumed to be smooth. Ratio of the
-    # density of white outline noise to the variance of a node [px].
-    error_spacing_px: float = 15.0
-    error_prior_px: float = 2.0
+    # Smooth outline errors of masks; None: errors of neighbouring samples are independent.
+    smooth_errors: SmoothErrors | None = SmoothErrors()
     # Side of the tiles over which errors are summed to measure it [px]: estimates change little from 20 to 45.
     tile_px: int = 30
     tile_factor: float = 1.5  # ratio of true to measured correlation length [-]: the fit absorbs part of the error

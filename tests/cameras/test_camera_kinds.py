@@ -62,9 +62,7 @@ def test_a_capture_names_cameras_whose_labels_have_dots_in_its_own_letters(tmp_p
     capture = SimpleNamespace(calibration=tmp_path / "a.xml", calibration_unit_mm=1.0, cameras=sources, folder=tmp_path)
     same(capture_cameras.load_cameras(capture), ("cam_01", "cam_02", "cam_03"))
     sources[0].name = "cam_09"
-    with pytest.raises(
-        CalibrationError, match=r"lacks camera cam_09 of the capture; it contains cam\.01, cam\.02"
-    ):
+    with pytest.raises(CalibrationError, match=r"lacks camera cam_09 of the capture; it contains cam\.01, cam\.02"):
         capture_cameras.load_cameras(capture)
 
 

@@ -194,7 +194,10 @@ ATTACKS = {
     "40,000 prims deep, validate": Attack(partial(layer, "validate", nested(40_000)), ENDED, "a library crashed"),
     "40,000 prims deep, view": Attack(partial(layer, "view", nested(40_000)), ENDED, "a library crashed"),
     "2 ** 28 prims": Attack(
-        partial(layer, "info", doubling(28)), ENDED, "processor time", 6_000,
+        partial(layer, "info", doubling(28)),
+        ENDED,
+        "processor time",
+        6_000,
         first="import jawusd.rig.untrusted as limits; limits.MAX_CPU_S = 4",  # instead of 20
     ),
     "2 ** 28 prims in 1 GB": Attack(

@@ -85,8 +85,11 @@ def test_keys_round_trip_and_faults(tmp_path):
         ('{"fps": 24, "keys": []}', "keys"),
         ('{"fps": 24, "keys": [{"frame": 1, "d": [0,0,0]}, {"frame": 1, "d": [0,0,0]}]}', "must increase"),
         ('{"fps": 0, "keys": [{"frame": 1, "d": [0,0,0]}]}', "fps"),
-        ('{"fps": 24, "keys": [{"frame": 1, "d": [0,0]}]}', r"keys, entry 1: d needs three numbers: d1, d2, d3 .*, "
-         r"found \[0, 0\]"),
+        (
+            '{"fps": 24, "keys": [{"frame": 1, "d": [0,0]}]}',
+            r"keys, entry 1: d needs three numbers: d1, d2, d3 .*, "
+            r"found \[0, 0\]",
+        ),
         ('{"fps": 24, "keys": [{"frame": 1, "d": [1e300,0,0]}]}', r"entry 1: d needs three.*found 1e\+300"),
         ('{"fps": 24, "keys": [{"frame": 1}]}', "keys, entry 1: d needs three numbers"),
         ('{"fps": 24, "keys": [{"frame": 1, "d": [0,0,0]}, {"frame": 2, "d": [0,"x",0]}]}', 'entry 2: d needs .*"x"'),

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jawusd.base.arrays import Array
+from jawusd.tracking.config import SmoothErrors
 from jawusd.tracking.contour.equations import OutlineSums
 from jawusd.tracking.contour.samples import (
     COLUMNS,
@@ -24,8 +25,8 @@ from jawusd.tracking.contour.samples import (
 )
 from jawusd.tracking.contour.smooth_errors import without_smooth_errors
 
-# Linear terms of a sample: derivative with respect to a twist (6), effects of annotator bias (tooth edge, gum line twice)
-# and distance to the edge.
+# Linear terms of a sample: derivatives with respect to a twist (6), effects of annotator bias (tooth edge, gum line in
+# px and mm), and distance to the edge.
 _GUM, _DISTANCE, _TERMS = 7, 9, 10
 _EDGE = 127.5  # mask value at the outline, where half of the pixel area belongs to the teeth
 
@@ -170,7 +171,7 @@ def accumulate_final(
     distances: Array,
     limits: tuple[float, float, float],
     where: tuple[Array, Array, Array],
-    smooth: tuple[float, float],
+    smooth: SmoothErrors | None,
     tile_px: int,
     sums: OutlineSums,
     r: int,
@@ -186,11 +187,13 @@ def accumulate_final(
 
     Args:
         samples, distances, limits, where: as for `accumulate`.
-        smooth: `spacing_px` and `prior_px` of `without_smooth_errors`; with a spacing of 0, no errors are removed.
+        smooth: model of the errors to remove; None to remove none.
         tile_px: side of the square tiles, longer than the correlation length.
     """
     rows, weights, pixels = _rows(samples, distances, limits, where, sums, r, c)
-    rest = without_smooth_errors(rows, weights, pixels, *smooth) if smooth[0] > 0 else rows
+    rest = rows
+    if smooth is not None:
+        rest = without_smooth_errors(rows, weights, pixels, smooth)
     _add(rows, rest, weights, sums, r, c)
     across = int(pixels[:, 0].max() / tile_px) + 1 if len(pixels) else 0
     down = int(pixels[:, 1].max() / tile_px) + 1 if len(pixels) else 0
@@ -261,7 +264,7 @@ def _add(rows: Array, rest: Array, weights: Array, sums: OutlineSums, r: int, c:
             for k in range(i + 1):
                 matrix[i, k] += w * rows[s, i] * rest[s, k]
         weight += w
-        square += w * rest[s, _DISTANCE] ** 2
+        square += w * rows[s, _DISTANCE] ** 2
     for i in range(_TERMS):
         for k in range(i):
             matrix[k, i] = matrix[i, k]

@@ -14,29 +14,29 @@ import numba
 import numpy as np
 
 from jawusd.base.arrays import Array
+from jawusd.tracking.config import SmoothErrors
 
 
 @numba.njit(nogil=True, cache=True)
-def without_smooth_errors(rows: Array, weights: Array, pixels: Array, spacing_px: float, prior_px: float) -> Array:
-    """Return the rows of samples minus their weighted least-squares fit by a smooth field.
+def without_smooth_errors(rows: Array, weights: Array, pixels: Array, smooth: SmoothErrors) -> Array:
+    """Return the rows of samples minus their weighted least-squares fit by a smooth field, times the gain.
 
-    For rows X, weights W, interpolation weights B and prior precision p, the result is X - B (B^T W B + p)^-1 B^T W X;
-    its product with W X is the matrix of generalised normal equations.
+    For rows X, weights W, interpolation weights B, prior precision p and gain g, the result is
+    g (X - B (B^T W B + p)^-1 B^T W X); its product with W X is the matrix of generalised normal equations.
 
     Args:
         rows: linear terms of every sample, shape (n, m).
         weights: weight of every sample [px], shape (n,).
         pixels: position of every sample in the image [px], shape (n, 2), not negative.
-        spacing_px: distance between the nodes of the field.
-        prior_px: ratio of the density of the white noise [px^3] to the variance of a node [px^2].
+        smooth: model of the errors.
     """
     count, terms = rows.shape
-    columns = int(pixels[:, 0].max() / spacing_px) + 2 if count else 0
-    lines = int(pixels[:, 1].max() / spacing_px) + 2 if count else 0
+    columns = int(pixels[:, 0].max() / smooth.spacing_px) + 2 if count else 0
+    lines = int(pixels[:, 1].max() / smooth.spacing_px) + 2 if count else 0
     number = np.full(columns * lines, -1)  # index of every grid node among those that are used
     nodes, shares, used = np.empty((count, 4), np.int64), np.empty((count, 4)), 0
     for s in range(count):
-        x, y = pixels[s, 0] / spacing_px, pixels[s, 1] / spacing_px
+        x, y = pixels[s, 0] / smooth.spacing_px, pixels[s, 1] / smooth.spacing_px
         i, j = int(x), int(y)
         for k in range(4):
             right, down = k % 2, k // 2
@@ -55,11 +55,11 @@ def without_smooth_errors(rows: Array, weights: Array, pixels: Array, spacing_px
             for t in range(terms):
                 right_sides[nodes[s, k], t] += share * rows[s, t]
     for k in range(used):
-        normal[k, k] += prior_px
+        normal[k, k] += smooth.prior_px
     field = np.linalg.solve(normal, right_sides)
-    out = rows.copy()
+    out = smooth.gain * rows
     for s in range(count):
         for k in range(4):
             for t in range(terms):
-                out[s, t] -= shares[s, k] * field[nodes[s, k], t]
+                out[s, t] -= smooth.gain * shares[s, k] * field[nodes[s, k], t]
     return out

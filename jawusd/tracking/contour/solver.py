@@ -14,7 +14,7 @@ import numpy as np
 
 from jawusd.base.arrays import Array, Mask
 from jawusd.geometry import bite_normal, orthonormalise, transform_point
-from jawusd.tracking.config import Item, Mapper, Result, TrackingConfig
+from jawusd.tracking.config import Item, Mapper, Result, SmoothErrors, TrackingConfig
 from jawusd.tracking.contour.correspondences import accumulate, accumulate_final, search_edges
 from jawusd.tracking.contour.equations import (
     NormalEquations,
@@ -38,13 +38,14 @@ _Match = tuple[Array, Array, float]
 
 
 class Matched(NamedTuple):
-    """The samples of an arch in a view, their distances to the mask edge, and the residual gate."""
+    """The samples of an arch in a view, their distances to the mask edge, the residual gate, and the error model."""
 
     arch: int
     camera: int
     samples: Array
     distances: Array
     gate_px: float
+    smooth: SmoothErrors | None
 
 
 class ContourSolver:
@@ -117,7 +118,7 @@ class ContourSolver:
         poses, iterations = self._converged(poses, tuple(gates_px), *given)
         gate = gates_px[-1] if gates_px else self.config.final_gate_px[1]
         state = self.linearise(poses, views, use, gate, rendering, final=True)
-        if gates_px and self._removes_smooth_errors(views, gate):
+        if gates_px and self._smooth_errors(views, gate):
             # From the least-squares solution, one step of generalised least squares is enough (Le Cam's one-step
             # estimator; van der Vaart 1998, section 5.7). From farther away, it would be slower.
             poses, _ = self._moved(poses, state, *given[3:])
@@ -160,9 +161,10 @@ class ContourSolver:
         # Predictions multiply poses frame after frame, so rounding errors would accumulate.
         return orthonormalise(np.stack(moved)), self._motion_mm(step)
 
-    def _removes_smooth_errors(self, views: Sequence[View], gate_px: float) -> bool:
-        narrow = gate_px <= self.config.final_gate_px[1]
-        return narrow and self.config.error_spacing_px > 0 and all(view.edges is None for view in views)
+    def _smooth_errors(self, views: Sequence[View], gate_px: float) -> SmoothErrors | None:
+        """Return the model of outline errors for a residual gate: only the last steps, with masks, have one."""
+        last = gate_px <= self.config.final_gate_px[1] and all(view.edges is None for view in views)
+        return self.config.smooth_errors if last else None
 
     def linearise(
         self,
@@ -200,17 +202,16 @@ class ContourSolver:
         scatters, gum_scatters, visible = np.zeros((2, 6, 6)), np.zeros((2, 6, 6)), np.zeros((2, len(views)))
         pull = config.pull if gate > config.pull_above_px else 0.0
         used = [gate, gate]
+        smooth = self._smooth_errors(views, gate) if final else None
         if gate <= config.final_gate_px[1]:
             used = [self._final_gate([matches[t][1] for t in tasks if t[0] == r], gate) for r in ARCHES]
         for r, c in tasks:
             samples, distances, visible[r, c] = matches[r, c]
             if matched is not None:
-                matched.append(Matched(r, c, samples, distances, used[r]))
+                matched.append(Matched(r, c, samples, distances, used[r], smooth))
             where = (moved[r, c], views[c].matrix, centres[r])
             limits = (used[r], config.score_gate_px, pull)
             if final:
-                spacing_px = config.error_spacing_px if self._removes_smooth_errors(views, gate) else 0.0
-                smooth = (spacing_px, config.error_prior_px)
                 last = accumulate_final(samples, distances, limits, where, smooth, config.tile_px, outline, r, c)
                 scatters[r] += last[0]
                 gum_scatters[r] += last[1]

@@ -12,6 +12,7 @@ import numpy as np
 from jawusd.base.arrays import Array
 from jawusd.geometry import transform_points
 from jawusd.tracking.contour.samples import HABITS, LENGTH, NX, NY, U, V, X, Z
+from jawusd.tracking.contour.smooth_errors import without_smooth_errors
 from jawusd.tracking.contour.solver import Matched
 from jawusd.tracking.contour.views import View
 from jawusd.tracking.initialization.magnification import displacement_slopes, principal_point
@@ -76,7 +77,11 @@ def growth_of(matched: Sequence[Matched], poses: Array, centres: Array, views: S
         points = transform_points(views[c].T_delay[r] @ poses[r], samples[:, X : Z + 1])
         along = displacement_slopes(samples, points, views[c].matrix)
         slope = np.hstack([np.cross(points - centres[r], along), along])
-        out.twist[r, c] = slope.T @ (weight * growth)
-        out.habit[r, c] = samples[:, HABITS].T @ (weight * growth)
-        out.own[r, c], out.distance[r, c] = weight @ growth**2, weight @ (growth * d)
+        rest = growth
+        if found.smooth is not None:
+            pixels = np.maximum(samples[:, U : V + 1], 0.0)
+            rest = without_smooth_errors(growth[:, None], weight, pixels, found.smooth)[:, 0]
+        out.twist[r, c] = slope.T @ (weight * rest)
+        out.habit[r, c] = samples[:, HABITS].T @ (weight * rest)
+        out.own[r, c], out.distance[r, c] = weight @ (growth * rest), weight @ (rest * d)
     return out
