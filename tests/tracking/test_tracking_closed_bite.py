@@ -121,7 +121,6 @@ def test_the_closed_bite_reduces_covariances():
 def _records(poses):
     nothing = (
         OutlineSums.zeros(2),
-        OutlineSums.zeros(2),
         np.zeros((2, 3)),
         np.zeros((2, 6, 6)),
         np.zeros((2, 6, 6)),

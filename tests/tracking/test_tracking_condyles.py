@@ -36,10 +36,9 @@ def taught(person, poses):
 
 
 def state(poses):
-    empty = OutlineSums.zeros(1)
     nothing = np.zeros((2, 6, 6))
     centres = np.array([[3.0, -2.0, 200.0], [1.0, 4.0, 205.0]])
-    return Solution(poses, empty, empty, centres, nothing, nothing, np.zeros((2, 1)), 0)
+    return Solution(poses, OutlineSums.zeros(1), centres, nothing, nothing, np.zeros((2, 1)), 0)
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])

@@ -139,7 +139,7 @@ def test_one_mask_does_not_outvote_two(tracker):
             {"suspect_residual": 0.1, "lost_residual": 50.0, "suspect_score": 1.8},
             r"matched contour 1?\d\d% of the usual; at least 180% is needed",
         ),
-        (LostReason.UNCOVERED_MASK, {"lost_coverage": 1e-5}, r"\d\.\d% of a mask is not covered .*; at most 0%"),
+        (LostReason.UNCOVERED_MASK, {"lost_coverage": -0.01}, r"\d\.\d% of a mask is not covered .*; at most -1%"),
         (LostReason.UNCERTAIN, {"lost_sigma_mm": 0.001}, r"expected error of the crowns 0\.\d\d mm; at most 0\.00 mm"),
     ],
 )

@@ -44,7 +44,6 @@ def terms(prior, poses, centres):
         Solution(
             poses,
             OutlineSums.zeros(0),
-            OutlineSums.zeros(0),
             centres,
             np.zeros((2, 6, 6)),
             np.zeros((2, 6, 6)),

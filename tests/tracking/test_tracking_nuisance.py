@@ -235,7 +235,6 @@ def _records(count, lost=()):
             poses[1], status[1] = se3_exp([0, 0, 0, 30.0, 0, 0]) @ poses[1], LOST
         nothing = (
             OutlineSums.zeros(2),
-            OutlineSums.zeros(2),
             np.ones((2, 3)),
             np.zeros((2, 6, 6)),
             np.zeros((2, 6, 6)),
@@ -331,7 +330,7 @@ def test_delays_and_habits_move_a_pose_as_least_squares_over_its_samples_would()
     records = {}
     for frame in (4, 5, 6):
         poses = np.stack([se3_exp((frame - 5) * speed)] * 2)
-        solution = Solution(poses, sums, OutlineSums.zeros(2), np.zeros((2, 3)), none, none, np.ones((2, 2)), 0)
+        solution = Solution(poses, sums, np.zeros((2, 3)), none, none, np.ones((2, 2)), 0)
         records[frame] = FrameRecord(solution, np.full(2, TRACKED), np.ones((2, 2), bool), np.zeros((2, 2)))
     nuisances = _nuisances(delays=np.array([0.0, 0.2]), habits=0.01 * rng.normal(size=(2, 2, 3)))
     for arch in (0, 1):

@@ -145,7 +145,7 @@ def test_a_performance_is_found_and_carried_through_closed_lips(jaw, scans, trut
 
 def test_sigma_covers_what_a_biased_annotator_does_to_depth(jaw, scans, truth, tmp_path, monkeypatch):
     """One camera; outlines outside of the upper teeth and inside of the lower ones."""
-    folder = write_masks(tmp_path, jaw, truth, small_take.CAMERAS[:1], (0.8, -0.3))
+    folder = write_masks(tmp_path, jaw, truth, small_take.CAMERAS[:1], (1.1, -0.4))
 
     def z2():
         found = solved(jaw, scans, truth, folder, small_take.CAMERAS[:1])
@@ -189,7 +189,7 @@ def test_a_jaw_that_the_rig_cannot_reproduce_moves_no_head(jaw, scans, truth, tm
         return np.linalg.norm(away, axis=-1).mean(1)[strange].max()
 
     found = head_mm(unsure), head_mm(jaw)
-    assert found[0] < 0.25 < 0.5 < found[1], found
+    assert found[0] < 0.2 < 0.35 < found[1], found
 
 
 def test_skin_measures_the_jaw_while_one_camera_sees_no_teeth(jaw, scans, truth, tmp_path):

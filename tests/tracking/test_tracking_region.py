@@ -137,8 +137,8 @@ def test_a_fit_counts_the_contour_in_sight_but_not_too_little_of_it(in_sight_px,
     counts = Counts.zeros()
     counts.in_sight_px[:] = in_sight_px
     view = RegionView(None, None, None, None, None, None, counts)
-    matched = SimpleNamespace(score_px=np.full((2, 1), 25.0)), SimpleNamespace(score_px=np.full((2, 1), 15.0))
-    solution = SimpleNamespace(silhouette=matched[0], gingival_margin=matched[1], visible_px=np.full((2, 1), 200.0))
+    matched = SimpleNamespace(score_px=np.full((2, 1), 40.0))
+    solution = SimpleNamespace(outline=matched, visible_px=np.full((2, 1), 200.0))
     np.testing.assert_allclose(fraction_in_sight(solution, [SimpleNamespace(edges=view)]), expected)
 
 

@@ -212,11 +212,8 @@ def test_a_jaw_out_of_sight_is_searched_although_the_head_fits_less_than_usual(m
 
 def solution_that_fits(upper_px, lower_px):
     """Return a solution of one camera of which so much contour fits, of 100 px per arch."""
-    silhouette = SimpleNamespace(score_px=np.array([[upper_px], [lower_px]]))
-    margin, poses = SimpleNamespace(score_px=np.zeros((2, 1))), np.stack([np.eye(4)] * 2)
-    return SimpleNamespace(
-        silhouette=silhouette, gingival_margin=margin, visible_px=np.full((2, 1), 100.0), poses=poses
-    )
+    outline, poses = SimpleNamespace(score_px=np.array([[upper_px], [lower_px]])), np.stack([np.eye(4)] * 2)
+    return SimpleNamespace(outline=outline, visible_px=np.full((2, 1), 100.0), poses=poses)
 
 
 @pytest.mark.parametrize(

@@ -140,7 +140,7 @@ def _fits(share, rough_px, frames=5):
     share, rough = np.array(share)[:, None] * np.ones(3), np.array(rough_px)[:, None] * np.ones(3)
     none, weight = OutlineSums.zeros(3), np.full((2, 3), 100.0)
     edges = none._replace(score_px=500 * share, weight=weight, square=100 * 0.828 * rough**2)
-    solution = SimpleNamespace(silhouette=edges, gingival_margin=none, visible_px=np.full((2, 3), 500.0))
+    solution = SimpleNamespace(outline=edges, visible_px=np.full((2, 3), 500.0))
     return {k: SimpleNamespace(solution=solution, found=np.ones(2, bool)) for k in range(frames)}
 
 

@@ -104,7 +104,7 @@ def seen(share, rough_px):
     share, rough = (np.array([usual, lower])[:, None] * np.ones(3) for usual, lower in ((0.6, share), (0.6, rough_px)))
     none, weight = OutlineSums.zeros(3), np.full((2, 3), 100.0)
     edges = none._replace(score_px=500 * share, weight=weight, square=100 * 0.828 * rough**2)
-    solution = SimpleNamespace(silhouette=edges, gingival_margin=none, visible_px=np.full((2, 3), 500.0))
+    solution = SimpleNamespace(outline=edges, visible_px=np.full((2, 3), 500.0))
     return FrameRecord(solution, np.full(2, TRACKED, np.int8), np.ones((2, 3), bool), np.zeros((2, 3)))
 
 

@@ -32,6 +32,7 @@ from jawusd.tracking.contour.views import Drawn, View, present_masks
 
 _ROUGH_FACES = 6_000  # number of crown faces of an arch in short trials: a third of that of a decimated scan
 _DENSE_STEPS = 2  # number of steps with all faces of a dense scan, after the decimated scan has converged
+_CONVERGED_MM = 0.1  # motion in the last step below which least squares counts as converged [mm at the crowns]
 
 # Samples, distances to the mask edge, visible contour length [px].
 _Match = tuple[Array, Array, float]
@@ -115,17 +116,17 @@ class ContourSolver:
         rendering = rendering or self.rendering(views)
         pull = StartTerm(poses, self._start_strength)
         given = (views, use, rendering, (OutlineTerm(), pull, *terms), outline_weight)
-        poses, iterations = self._converged(poses, tuple(gates_px), *given)
+        poses, iterations, moved_mm = self._descended(poses, tuple(gates_px), *given)
         gate = gates_px[-1] if gates_px else self.config.final_gate_px[1]
         state = self.linearise(poses, views, use, gate, rendering, final=True)
-        if gates_px and self._smooth_errors(views, gate):
+        if moved_mm < _CONVERGED_MM and self._smooth_errors(views, gate):
             # From the least-squares solution, one step of generalised least squares is enough (Le Cam's one-step
-            # estimator; van der Vaart 1998, section 5.7). From farther away, it would be slower.
+            # estimator; van der Vaart 1998, section 5.7).
             poses, _ = self._moved(poses, state, *given[3:])
             state = self.linearise(poses, views, use, gate, rendering, final=True)
         return replace(state, iterations=iterations)
 
-    def _converged(
+    def _descended(
         self,
         poses: Array,
         gates_px: tuple[float, ...],
@@ -134,12 +135,15 @@ class ContourSolver:
         rendering: Rendering,
         terms: Sequence[ResidualTerm],
         outline_weight: Array | None,
-    ) -> tuple[Array, int]:
-        """Return the least-squares solution, shape (2, 4, 4), and the number of steps; arguments are as for `solve`."""
-        earlier, left = 0, gates_px
+    ) -> tuple[Array, int, float]:
+        """Return the poses (2, 4, 4) after steps of least squares, their number, and the motion in the last one [mm].
+
+        Arguments are as for `solve`.
+        """
+        earlier, left, moved_mm = 0, gates_px, np.inf
         if self.thin is not None and left:
             given = (views, use, self.thin.rendering(views), terms, outline_weight)
-            poses, earlier = self.thin._converged(poses, left, *given)
+            poses, earlier, _ = self.thin._descended(poses, left, *given)
             left = left[-1:] * _DENSE_STEPS
         iterations = 0
         while left:
@@ -147,7 +151,7 @@ class ContourSolver:
             state = self.linearise(poses, views, use, left[0], rendering)
             poses, moved_mm = self._moved(poses, state, terms, outline_weight)
             left = self.config.gates_after(left, moved_mm)
-        return poses, earlier + iterations
+        return poses, earlier + iterations, moved_mm
 
     def _moved(
         self, poses: Array, state: Solution, terms: Sequence[ResidualTerm], outline_weight: Array | None
