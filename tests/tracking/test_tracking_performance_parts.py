@@ -22,7 +22,10 @@ from jawusd.geometry import (
     se3_log,
     transform_point,
 )
+from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.contour.annotator import DRAWN, AnnotatorPrior
+from jawusd.tracking.contour.equations import OutlineSums
+from jawusd.tracking.performance.attempts import Attempts, Trial
 from jawusd.tracking.performance.coordinates import HEAD, JAW, LOCAL, OPENING, Coordinates, Pose
 from jawusd.tracking.performance.instant import CLOSED_MM, Misfit, bound_equations, rig_gain
 from jawusd.tracking.performance.motion import measured_motion
@@ -309,3 +312,21 @@ def test_the_table_is_read_as_parameters(performance, tmp_path):
     np.testing.assert_allclose(d, performance.d, atol=1e-6)
     lines = (tmp_path / "take.csv").read_text().splitlines()
     assert lines[5].endswith("inside,carried") and lines[-1].endswith("off the model; outside,solved")
+
+
+@pytest.mark.parametrize(("uncovered_px", "lost"), [(60.0, False), (400.0, True)])
+def test_an_arch_is_lost_if_it_leaves_more_mask_uncovered_than_its_contour_is_worth(uncovered_px, lost):
+    """One camera; both uncovered fractions are below the limit, and residuals and matched contour are good enough."""
+    outline = OutlineSums.zeros(1)._replace(
+        score_px=np.array([[40.0], [320.0]]), matched_px=np.array([[60.0], [350.0]]), weight=np.ones((2, 1))
+    )
+    trial = Trial(
+        pose=Pose(np.eye(4), np.zeros(3)),
+        solution=SimpleNamespace(outline=outline),
+        use=np.ones((2, 1), bool),
+        uncovered_px=np.array([[uncovered_px], [30.0]]),
+        mask_px=np.full((2, 1), 4000.0),
+    )
+    assert TrackingConfig().lost_coverage > uncovered_px / 4000.0
+    attempts = Attempts(SimpleNamespace(config=TrackingConfig()), np.ones(2))
+    assert attempts.bad(trial).tolist() == [lost, False]

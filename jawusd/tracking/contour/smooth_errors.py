@@ -1,11 +1,11 @@
 """Smooth errors of outlines as nuisance parameters.
 
-Whoever draws or segments teeth leaves the true outline for some millimetres at a time, so neighbouring samples have
-nearly the same error. Least squares treats samples as independent, and follows such errors wherever the contour is
-long. Here, the error is a smooth field over the image plus white noise: the field is interpolated bilinearly between
-nodes on a grid, whose values have a normal prior, and are eliminated from the normal equations (generalised least
-squares; Aitken 1936). What remains are differences over less than the node spacing, such as the two sides of a gap
-between teeth, in which smooth errors cancel.
+Hand-drawn outlines leave the true one for some millimetres at a time, so neighbouring samples have nearly the same
+error. Least squares treats samples as independent, and follows such errors wherever the contour is long. Here, the
+error is a smooth field over the image plus white noise: the field is interpolated bilinearly between nodes on a grid.
+Their values have a normal prior, and are eliminated from the normal equations (generalised least squares; Aitken 1936).
+What remains are differences over less than the node spacing, such as the two sides of a gap between teeth, in which
+smooth errors cancel.
 """
 
 from __future__ import annotations

@@ -114,15 +114,15 @@ class ContourSolver:
         """
         use = present_masks(views) if use is None else use
         rendering = rendering or self.rendering(views)
-        pull = StartTerm(poses, self._start_strength)
-        given = (views, use, rendering, (OutlineTerm(), pull, *terms), outline_weight)
+        all_terms: tuple[ResidualTerm, ...] = (OutlineTerm(), StartTerm(poses, self._start_strength), *terms)
+        given = (views, use, rendering, all_terms, outline_weight)
         poses, iterations, moved_mm = self._descended(poses, tuple(gates_px), *given)
         gate = gates_px[-1] if gates_px else self.config.final_gate_px[1]
         state = self.linearise(poses, views, use, gate, rendering, final=True)
         if moved_mm < _CONVERGED_MM and self._smooth_errors(views, gate):
             # From the least-squares solution, one step of generalised least squares is enough (Le Cam's one-step
             # estimator; van der Vaart 1998, section 5.7).
-            poses, _ = self._moved(poses, state, *given[3:])
+            poses, _ = self._moved(poses, state, all_terms, outline_weight)
             state = self.linearise(poses, views, use, gate, rendering, final=True)
         return replace(state, iterations=iterations)
 
