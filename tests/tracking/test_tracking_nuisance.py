@@ -126,8 +126,8 @@ def _track_knocked(capture, **options):
 
 
 def _landmarks_mm(tracks, truth):
-    """Return the mean error of the landmarks in the skull frame: no motion of the world changes it."""
-    return np.mean(
+    """Return the mean error of the landmarks in the skull frame over tracked frames; motions of the world cancel."""
+    return np.nanmean(
         [
             np.linalg.norm(LANDMARKS @ (a - b)[:3, :3].T + (a - b)[:3, 3], axis=1)
             for a, b in zip(tracks.raw_T_upper_lower, truth.raw_T_upper_lower)
