@@ -125,7 +125,7 @@ def test_one_camera_finds_the_jaw_again_if_it_was_predicted_too_far_in_front(rig
 def test_one_camera_starts_right_from_a_jaw_too_far_in_front(rig, monkeypatch, corrected):
     if not corrected:
         monkeypatch.setattr("jawusd.tracking.region.rig_tracker._CLEARER", -1.0)
-    tracker, (first, _), (near, _) = tracker_of_one_camera(rig, 45)
+    tracker, (first, _), (near, _) = tracker_of_one_camera(rig, 147)
     found = tracker.begin(first, replace(near, d=near.d + [0.0, 0.0, 12.0]))
     error_mm = np.abs(found.pose.d - near.d).max()
     assert error_mm < 1.0 if corrected else error_mm > 2.0
