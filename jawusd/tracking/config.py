@@ -23,8 +23,8 @@ class SmoothErrors(NamedTuple):
 
     spacing_px: float = 15.0  # spacing of the nodes
     prior_px: float = 2.0  # ratio of the density of the white noise [px^3] to the variance of a node [px^2]
-    # Factor on the remaining information [-]: variance times correlation length of all errors, over that of the noise.
-    gain: float = 2.5
+    # Variance times correlation length of all errors, over that of the white noise [-]: weight of what remains.
+    noise_ratio: float = 2.5
 
 
 @dataclass(frozen=True)

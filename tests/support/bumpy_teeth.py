@@ -112,6 +112,7 @@ def render_masks(
     rng: np.random.Generator | None = None,
     fine: int = 3,
     grown_px: float = 0.0,
+    smooth_px: float = 3.0,
 ) -> np.ndarray:
     """Return the visible crowns of both rows as soft masks, (2, h, w) uint8.
 
@@ -124,6 +125,7 @@ def render_masks(
         rng: source of that error.
         fine: sub-pixels per side; odd, or thresholding the result at one half would widen it.
         grown_px: how far the outline lies outside of the teeth.
+        smooth_px: standard deviation of the Gaussian filter that makes the error smooth.
     """
     width, height = camera.size_px
     big = camera.scaled((width * fine, height * fine))
@@ -143,15 +145,17 @@ def render_masks(
             rows = np.arange(depth.shape[0])
             masks[:, rows < edge if above else rows > edge] = False
     out = np.stack([cv2.resize(m.astype(np.uint8) * 255, (width, height), interpolation=cv2.INTER_AREA) for m in masks])
-    return np.stack([_shaken(m, noise_px, grown_px, rng) for m in out]) if noise_px else out
+    return np.stack([_shaken(m, noise_px, grown_px, smooth_px, rng) for m in out]) if noise_px else out
 
 
-def _shaken(mask: np.ndarray, sigma_px: float, grown_px: float, rng: np.random.Generator) -> np.ndarray:
+def _shaken(
+    mask: np.ndarray, sigma_px: float, grown_px: float, smooth_px: float, rng: np.random.Generator
+) -> np.ndarray:
     """Move the outline of a mask by a smooth random field, and outwards."""
     inside = (mask > 127).astype(np.uint8)
     signed = cv2.distanceTransform(inside, cv2.DIST_L2, 5) - cv2.distanceTransform(1 - inside, cv2.DIST_L2, 5)
     signed = np.where(inside > 0, signed - 0.5, signed + 0.5)
-    field = cv2.GaussianBlur(rng.normal(size=mask.shape), (0, 0), 3.0)
+    field = cv2.GaussianBlur(rng.normal(size=mask.shape), (0, 0), smooth_px)
     signed = signed + grown_px + field * sigma_px / field.std()
     return np.clip(127.5 + 255 * signed, 0, 255).astype(np.uint8)
 

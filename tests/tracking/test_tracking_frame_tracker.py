@@ -139,13 +139,16 @@ def test_one_mask_does_not_outvote_two(tracker):
             {"suspect_residual": 0.1, "lost_residual": 50.0, "suspect_score": 1.8},
             r"matched contour 1?\d\d% of the usual; at least 180% is needed",
         ),
-        (LostReason.UNCOVERED_MASK, {"lost_coverage": -0.01}, r"\d\.\d% of a mask is not covered .*; at most -1%"),
+        (LostReason.UNCOVERED_MASK, {"lost_coverage": 1e-5}, r"\d\.\d% of a mask is not covered .*; at most 0%"),
         (LostReason.UNCERTAIN, {"lost_sigma_mm": 0.001}, r"expected error of the crowns 0\.\d\d mm; at most 0\.00 mm"),
     ],
 )
 def test_every_check_reports_its_value_and_limit(tracker, reason, limits, words):
     strict = FrameTracker(ContourSolver(SCANS, CONFIG), replace(CONFIG, **limits), tracker.history)
-    record = strict.track([POSES[1]], _views(1), None)
+    views = _views(1)
+    for view in views:
+        view.masks[:, 2, 2] = 255  # every mask has a pixel that no scan covers
+    record = strict.track([POSES[1]], views, None)
     assert record.status.tolist() == [LOST, LOST] and {loss.reason for loss in record.losses} == {reason}
     for loss in record.losses:
         assert re.search(words, loss.reason.explain(loss.value, loss.limit))

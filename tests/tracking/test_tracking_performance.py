@@ -176,7 +176,7 @@ def test_a_wrong_mask_in_one_of_several_cameras_costs_no_frame(jaw, scans, truth
 def test_a_jaw_that_the_rig_cannot_reproduce_moves_no_head(jaw, scans, truth, tmp_path):
     """Two cameras; in two of the frames, one of these has no mask of the upper teeth."""
     strange = range(6, 10)
-    misfits = {k: np.array([0.02, 0.0, 0.0, 0.4, -0.9, 1.4]) for k in strange}
+    misfits = {k: np.array([0.03, 0.0, 0.0, 0.6, -1.3, 2.0]) for k in strange}
     folder = write_masks(tmp_path, jaw, truth, small_take.CAMERAS[:2], misfits=misfits)
     for k in (6, 9):
         small_take.png(folder, "cam1", "upper", k).unlink()
@@ -189,7 +189,7 @@ def test_a_jaw_that_the_rig_cannot_reproduce_moves_no_head(jaw, scans, truth, tm
         return np.linalg.norm(away, axis=-1).mean(1)[strange].max()
 
     found = head_mm(unsure), head_mm(jaw)
-    assert found[0] < 0.2 < 0.35 < found[1], found
+    assert found[0] < 0.25 < 0.5 < found[1], found
 
 
 def test_skin_measures_the_jaw_while_one_camera_sees_no_teeth(jaw, scans, truth, tmp_path):

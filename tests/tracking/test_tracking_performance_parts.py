@@ -315,7 +315,7 @@ def test_the_table_is_read_as_parameters(performance, tmp_path):
 
 
 @pytest.mark.parametrize(("uncovered_px", "lost"), [(60.0, False), (400.0, True)])
-def test_an_arch_is_lost_if_it_leaves_more_mask_uncovered_than_its_contour_is_worth(uncovered_px, lost):
+def test_an_arch_is_lost_if_the_penalty_for_uncovered_mask_exceeds_its_matched_contour(uncovered_px, lost):
     """One camera; both uncovered fractions are below the limit, and residuals and matched contour are good enough."""
     outline = OutlineSums.zeros(1)._replace(
         score_px=np.array([[40.0], [320.0]]), matched_px=np.array([[60.0], [350.0]]), weight=np.ones((2, 1))

@@ -61,7 +61,7 @@ def test_landmark_sigmas_do_not_pair_poses_with_landmarks():
 
 @pytest.fixture(scope="module")
 def noisy_fits():
-    """Solutions and true poses for outline errors of 0.4 px, correlated over about 10 px."""
+    """Solutions and true poses for outline errors of 0.4 px, correlated over about 25 px, as in drawn masks."""
     rng = np.random.default_rng(6)
     solver, out = ContourSolver(SCANS, CONFIG), []
     for poses in jaw_poses(12):
@@ -69,7 +69,7 @@ def noisy_fits():
             View(
                 c.projection_matrix(),
                 c.centre_world(),
-                render_masks(MESHES, poses, c, None, 0.4, rng),
+                render_masks(MESHES, poses, c, None, 0.4, rng, smooth_px=8.0),
                 np.ones(2, bool),
             )
             for c in make_cameras()
@@ -87,7 +87,7 @@ def test_covariances_match_the_errors_made(noisy_fits):
             C = twist_covariance(solution, r, residual_px(solution)[r], length)
             x = se3_log(truth[r] @ se3_inverse(solution.poses[r]))
             nees.append(x @ np.linalg.solve(C, x) / 6)
-    assert 0.4 < np.mean(nees) < 2  # the errors made here have no smooth part, so removing one loses information
+    assert 0.5 < np.mean(nees) < 2
 
 
 def test_sigma_of_the_crowns_follows_the_information(noisy_fits):

@@ -38,7 +38,7 @@ def test_a_smooth_error_is_removed_and_a_sudden_one_is_not():
     pixels = np.concatenate([np.column_stack([t, np.full_like(t, y)]) for y in (36.0, 39.0)])
     weights, side = np.full(len(pixels), 0.5), np.repeat([1.0, -1.0], len(t))
     rows = np.column_stack([np.ones(len(pixels)), side])
-    rest = without_smooth_errors(rows, weights, pixels, SmoothErrors(gain=1.0))
+    rest = without_smooth_errors(rows, weights, pixels, SmoothErrors(noise_ratio=1.0))
     common, opposite = (rest**2).mean(0)
     assert 20 * common < opposite
 

@@ -11,7 +11,7 @@ from scipy import ndimage
 from jawusd.geometry import make_transform, rigidity_defect, se3_exp, se3_inverse, transform_point, transform_points
 from jawusd.meshes.raster import draw_depth_labels, project
 from jawusd.tracking.config import TrackingConfig
-from jawusd.tracking.contour.correspondences import accumulate, search_edges
+from jawusd.tracking.contour.correspondences import accumulate, linear_terms, search_edges
 from jawusd.tracking.contour.equations import NormalEquations, OutlineSums, OutlineTerm
 from jawusd.tracking.contour.samples import (
     COLUMNS,
@@ -175,7 +175,8 @@ def test_normal_equations_agree_with_finite_differences():
     distances = rng.normal(size=len(samples)) * 0.5
     centre = transform_point(pose, SCANS[1].centre)
     where, found = (pose, camera.projection_matrix(), centre), OutlineSums.zeros(1)
-    accumulate(samples, distances, (2.0, 2.5, 0.0), where, found, 1, 0)
+    terms = linear_terms(samples, distances, (2.0, 2.5, 0.0), where, found, 1, 0)
+    accumulate(terms, terms.rows, found, 1, 0)
     precision, gradient, habit_slope, habit_distance, habit_weight, *sums = (table[1, 0] for table in found)
     h, J = 1e-5, np.empty((len(samples), 6))
     to, back = make_transform(np.eye(3), -centre), make_transform(np.eye(3), centre)

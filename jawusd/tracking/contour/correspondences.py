@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from jawusd.base.arrays import Array
-from jawusd.tracking.config import SmoothErrors
 from jawusd.tracking.contour.equations import OutlineSums
 from jawusd.tracking.contour.samples import (
     COLUMNS,
@@ -23,11 +24,8 @@ from jawusd.tracking.contour.samples import (
     Z,
     pixel_of,
 )
-from jawusd.tracking.contour.smooth_errors import without_smooth_errors
 
-# Linear terms of a sample: derivatives with respect to a twist (6), effects of annotator bias (tooth edge, gum line in
-# px and mm), and distance to the edge.
-_GUM, _DISTANCE, _TERMS = 7, 9, 10
+_GUM, _DISTANCE, _TERMS = 7, 9, 10  # columns of `LinearTerms.rows`, and their number
 _EDGE = 127.5  # mask value at the outline, where half of the pixel area belongs to the teeth
 
 
@@ -140,8 +138,18 @@ def _slope(sample: Array, pose: Array, matrix: Array, centre: Array, jacobian: A
     jacobian[2] = a * jacobian[4] - b * jacobian[3]
 
 
+class LinearTerms(NamedTuple):
+    """Linear terms of the n samples within the gate."""
+
+    # Derivative with respect to a twist (6), effects of annotator bias (tooth edge, gum line in px and mm), and
+    # distance to the mask edge, shape (n, 10).
+    rows: Array
+    weights: Array  # Tukey weight times contour length [px], shape (n,)
+    pixels: Array  # position in the image [px], not negative, shape (n, 2)
+
+
 @numba.njit(nogil=True, cache=True)
-def accumulate(
+def linear_terms(
     samples: Array,
     distances: Array,
     limits: tuple[float, float, float],
@@ -149,8 +157,8 @@ def accumulate(
     sums: OutlineSums,
     r: int,
     c: int,
-) -> None:
-    """Add the Tukey-weighted normal equations of one arch r in one view c to sums.
+) -> LinearTerms:
+    """Return the linear terms of the samples of one arch r in one view c; add their lengths and scores to sums.
 
     The residual d of a sample with image normal n decreases by n . du if the sample moves by du in the image; du is
     caused by a left twist (omega, v) of the arch about a centre (Drummond & Cipolla 2002 use the same distances).
@@ -160,65 +168,6 @@ def accumulate(
         limits: residuals above which the Tukey weight and the contribution to the score are zero [px]; and the weight,
             at the former, of samples deep inside the mask.
         where: scan to world (4, 4), world [mm] to homogeneous px (3, 4), centre of the twist in the world (3,) [mm].
-    """
-    rows, weights, _ = _rows(samples, distances, limits, where, sums, r, c)
-    _add(rows, rows, weights, sums, r, c)
-
-
-@numba.njit(nogil=True, cache=True)
-def accumulate_final(
-    samples: Array,
-    distances: Array,
-    limits: tuple[float, float, float],
-    where: tuple[Array, Array, Array],
-    smooth: SmoothErrors | None,
-    tile_px: int,
-    sums: OutlineSums,
-    r: int,
-    c: int,
-) -> tuple[Array, Array]:
-    """Add normal equations without smooth outline errors to sums; return the scatter of the rest over image tiles.
-
-    The first result, shape (6, 6), is the sum of s s^T over the tiles, where s is the sum of w J d over the samples in
-    a tile. The second result uses the gum fraction instead of d: the effect of a gum line that is one pixel off in each
-    tile. Outline errors are correlated along the contour, so they are summed within a tile before they are squared. The
-    ratio of the result to the normal matrix gives the correlation length (cluster-robust covariance, Liang & Zeger
-    1986).
-
-    Args:
-        samples, distances, limits, where: as for `accumulate`.
-        smooth: model of the errors to remove; None to remove none.
-        tile_px: side of the square tiles, longer than the correlation length.
-    """
-    rows, weights, pixels = _rows(samples, distances, limits, where, sums, r, c)
-    rest = rows
-    if smooth is not None:
-        rest = without_smooth_errors(rows, weights, pixels, smooth)
-    _add(rows, rest, weights, sums, r, c)
-    across = int(pixels[:, 0].max() / tile_px) + 1 if len(pixels) else 0
-    down = int(pixels[:, 1].max() / tile_px) + 1 if len(pixels) else 0
-    scatter, gum = np.zeros((down * across, 6)), np.zeros((down * across, 6))
-    for s in range(len(rows)):
-        tile = int(pixels[s, 1] / tile_px) * across + int(pixels[s, 0] / tile_px)
-        for k in range(6):
-            scatter[tile, k] += weights[s] * rest[s, _DISTANCE] * rows[s, k]
-            gum[tile, k] += weights[s] * rest[s, _GUM] * rows[s, k]
-    return scatter.T @ scatter, gum.T @ gum
-
-
-@numba.njit(nogil=True, cache=True)
-def _rows(
-    samples: Array,
-    distances: Array,
-    limits: tuple[float, float, float],
-    where: tuple[Array, Array, Array],
-    sums: OutlineSums,
-    r: int,
-    c: int,
-) -> tuple[Array, Array, Array]:
-    """Return the linear terms (n, 10), weights (n,) and pixels (n, 2) of the samples within the gate; add the lengths.
-
-    The terms of a sample are its derivative with respect to the twist, the effects of annotator bias, and its distance.
     """
     gate_px, score_gate_px, pull = limits
     pose, matrix, centre = where
@@ -250,12 +199,16 @@ def _rows(
             rows[n, 6 + a] = sample[EDGE_SHARE + a]
         rows[n, _DISTANCE] = d
         n += 1
-    return rows[:n], weights[:n], pixels[:n]
+    return LinearTerms(rows[:n], weights[:n], pixels[:n])
 
 
 @numba.njit(nogil=True, cache=True)
-def _add(rows: Array, rest: Array, weights: Array, sums: OutlineSums, r: int, c: int) -> None:
-    """Add the sums of weighted products of the samples' terms, `rows`, with the terms without smooth errors, `rest`."""
+def accumulate(terms: LinearTerms, rest: Array, sums: OutlineSums, r: int, c: int) -> None:
+    """Add the weighted normal equations of one arch r in one view c to sums.
+
+    `rest` are the rows of the terms without smooth outline errors, or the rows themselves, shape (n, 10).
+    """
+    rows, weights, _ = terms
     matrix = np.zeros((_TERMS, _TERMS))
     weight = square = 0.0
     for s in range(len(rows)):
@@ -275,3 +228,28 @@ def _add(rows: Array, rest: Array, weights: Array, sums: OutlineSums, r: int, c:
     sums.habit_weight[r, c] += matrix[6:_DISTANCE, 6:_DISTANCE]
     sums.weight[r, c] += weight
     sums.square[r, c] += square
+
+
+@numba.njit(nogil=True, cache=True)
+def scatter_of_tiles(terms: LinearTerms, rest: Array, tile_px: int) -> tuple[Array, Array]:
+    """Return the sum of s s^T over image tiles, shape (6, 6), where s is the sum of w J d over the samples in a tile.
+
+    The second result uses the gum fraction instead of d: the effect of a gum line that is one pixel off in each tile.
+
+    Outline errors are correlated along the contour, so they are summed within a tile before they are squared. The ratio
+    of the result to the normal matrix gives the correlation length (cluster-robust covariance, Liang & Zeger 1986).
+
+    Args:
+        rest: as for `accumulate`.
+        tile_px: side of the square tiles, longer than the correlation length.
+    """
+    rows, weights, pixels = terms
+    across = int(pixels[:, 0].max() / tile_px) + 1 if len(pixels) else 0
+    down = int(pixels[:, 1].max() / tile_px) + 1 if len(pixels) else 0
+    scatter, gum = np.zeros((down * across, 6)), np.zeros((down * across, 6))
+    for s in range(len(rows)):
+        tile = int(pixels[s, 1] / tile_px) * across + int(pixels[s, 0] / tile_px)
+        for k in range(6):
+            scatter[tile, k] += weights[s] * rest[s, _DISTANCE] * rows[s, k]
+            gum[tile, k] += weights[s] * rest[s, _GUM] * rows[s, k]
+    return scatter.T @ scatter, gum.T @ gum

@@ -67,7 +67,7 @@ class Solution:
     poses: Array  # T_world_upper and T_world_lower, shape (2, 4, 4)
     outline: OutlineSums  # sums over the matched samples of silhouettes, borders of the scans and crown-gum lines
     centres: Array  # centres of the twists in world coordinates [mm], shape (2, 3)
-    scatters: Array  # first result of `accumulate_final` (outline errors) per arch, summed over views, shape (2, 6, 6)
+    scatters: Array  # first result of `scatter_of_tiles` (outline errors) per arch, summed over views, shape (2, 6, 6)
     gum_scatters: Array  # second result (gum-line errors) per arch, summed over views, shape (2, 6, 6)
     visible_px: Array  # contour length that could have been matched, per arch and view [px], shape (2, C)
     iterations: int  # number of linearised steps

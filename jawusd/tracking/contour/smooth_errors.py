@@ -1,7 +1,7 @@
 """Smooth errors of outlines as nuisance parameters.
 
-Hand-drawn outlines leave the true one for some millimetres at a time, so neighbouring samples have nearly the same
-error. Least squares treats samples as independent, and follows such errors wherever the contour is long. Here, the
+Errors of hand-drawn outlines change little over a few millimetres, so neighbouring samples have nearly the same error.
+Least squares treats samples as independent, and gives such errors too much weight where the contour is long. Here, the
 error is a smooth field over the image plus white noise: the field is interpolated bilinearly between nodes on a grid.
 Their values have a normal prior, and are eliminated from the normal equations (generalised least squares; Aitken 1936).
 What remains are differences over less than the node spacing, such as the two sides of a gap between teeth, in which
@@ -19,9 +19,9 @@ from jawusd.tracking.config import SmoothErrors
 
 @numba.njit(nogil=True, cache=True)
 def without_smooth_errors(rows: Array, weights: Array, pixels: Array, smooth: SmoothErrors) -> Array:
-    """Return the rows of samples minus their weighted least-squares fit by a smooth field, times the gain.
+    """Return the rows of samples minus their weighted least-squares fit by a smooth field, times the noise ratio.
 
-    For rows X, weights W, interpolation weights B, prior precision p and gain g, the result is
+    For rows X, weights W, interpolation weights B, prior precision p and noise ratio g, the result is
     g (X - B (B^T W B + p)^-1 B^T W X); its product with W X is the matrix of generalised normal equations.
 
     Args:
@@ -57,9 +57,9 @@ def without_smooth_errors(rows: Array, weights: Array, pixels: Array, smooth: Sm
     for k in range(used):
         normal[k, k] += smooth.prior_px
     field = np.linalg.solve(normal, right_sides)
-    out = smooth.gain * rows
+    out = smooth.noise_ratio * rows
     for s in range(count):
         for k in range(4):
             for t in range(terms):
-                out[s, t] -= smooth.gain * shares[s, k] * field[nodes[s, k], t]
+                out[s, t] -= smooth.noise_ratio * shares[s, k] * field[nodes[s, k], t]
     return out

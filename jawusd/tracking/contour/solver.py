@@ -15,7 +15,7 @@ import numpy as np
 from jawusd.base.arrays import Array, Mask
 from jawusd.geometry import bite_normal, orthonormalise, transform_point
 from jawusd.tracking.config import Item, Mapper, Result, SmoothErrors, TrackingConfig
-from jawusd.tracking.contour.correspondences import accumulate, accumulate_final, search_edges
+from jawusd.tracking.contour.correspondences import accumulate, linear_terms, scatter_of_tiles, search_edges
 from jawusd.tracking.contour.equations import (
     NormalEquations,
     OutlineSums,
@@ -28,6 +28,7 @@ from jawusd.tracking.contour.equations import (
 from jawusd.tracking.contour.rendering import Contour, Drawings, Rendering
 from jawusd.tracking.contour.samples import HABITS, LENGTH
 from jawusd.tracking.contour.scan import ARCHES, Scan, thinned
+from jawusd.tracking.contour.smooth_errors import without_smooth_errors
 from jawusd.tracking.contour.views import Drawn, View, present_masks
 
 _ROUGH_FACES = 6_000  # number of crown faces of an arch in short trials: a third of that of a decimated scan
@@ -215,12 +216,13 @@ class ContourSolver:
                 matched.append(Matched(r, c, samples, distances, used[r], smooth))
             where = (moved[r, c], views[c].matrix, centres[r])
             limits = (used[r], config.score_gate_px, pull)
+            linear = linear_terms(samples, distances, limits, where, outline, r, c)
+            rest = without_smooth_errors(*linear, smooth) if smooth is not None else linear.rows
+            accumulate(linear, rest, outline, r, c)
             if final:
-                last = accumulate_final(samples, distances, limits, where, smooth, config.tile_px, outline, r, c)
-                scatters[r] += last[0]
-                gum_scatters[r] += last[1]
-            else:
-                accumulate(samples, distances, limits, where, outline, r, c)
+                own, gum = scatter_of_tiles(linear, rest, config.tile_px)
+                scatters[r] += own
+                gum_scatters[r] += gum
         return Solution(poses.copy(), outline, centres, scatters, gum_scatters, visible, 0)
 
     def _match(self, pose: Array, view: View, r: int, rendering: Rendering, c: int, reach: float) -> _Match:

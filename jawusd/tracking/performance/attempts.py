@@ -59,13 +59,13 @@ class Trial:
     uncovered_px: Array
     mask_px: Array
 
-    def gain_px(self, price: float) -> Array:
+    def fit_px(self, price: float) -> Array:
         """Return the matched contour minus the penalty for uncovered mask, per arch [px], shape (2,)."""
         return np.where(self.use, score_px(self.solution) - price * self.uncovered_px, 0.0).sum(1)
 
     def objective(self, price: float) -> float:
-        """Return the score that ranks attempts: the sum of `gain_px` over both arches [px]."""
-        return float(self.gain_px(price).sum())
+        """Return the score that ranks attempts: the sum of `fit_px` over both arches [px]."""
+        return float(self.fit_px(price).sum())
 
     @property
     def uncovered(self) -> Array:
@@ -127,7 +127,7 @@ class Attempts:
         rough = ~(residual_px(trial.solution) <= c.lost_residual * c.suspect_residual * usual)
         uncovered = np.where(trial.use, trial.uncovered, 0.0).max(1) > c.lost_coverage
         few = matched_px(trial.solution) < _LEAST_MATCHED_PX
-        return np.asarray(trial.use.any(1) & (rough | uncovered | few | (trial.gain_px(c.uncovered_price) <= 0.0)))
+        return np.asarray(trial.use.any(1) & (rough | uncovered | few | (trial.fit_px(c.uncovered_price) <= 0.0)))
 
     def without_wrong_masks(self, trial: Trial, expected: Expected, instant: Instant) -> Trial:
         """Leave out a single mask of each arch that does not fit, if the arch then fits its other masks.
