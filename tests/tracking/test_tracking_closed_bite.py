@@ -1,5 +1,7 @@
 """The registration error of scans and the constant error of a take, from closed-bite frames."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -22,7 +24,7 @@ from jawusd.tracking.sequence.closed_bite import (
 )
 
 POINT = np.array([3.0, -4.0, 20.0])
-REST = RestFrames((0, 1, 2, 3), True, POINT, POINT + (0, -5, 0), False)
+REST = RestFrames(dict.fromkeys(range(4), 1.0), True, POINT, POINT + (0, -5, 0), False)
 FRAMES = np.arange(12)
 SIGMA = np.r_[np.full(3, 0.002), np.full(3, 0.04)]  # sigma of a pose about the point [rad, mm]
 
@@ -134,18 +136,47 @@ def _records(poses):
 def test_rest_frames_are_those_around_the_named_one_or_the_most_closed():
     poses, _ = _take()
     up, probes = np.array([0.0, 1.0, 0.0]), POINT + np.random.default_rng(2).normal(size=(30, 3)) * 10
-    assert rest_frames(_records(poses), 1, up, POINT, probes) == (0, 1, 2, 3)
-    assert rest_frames(_records(poses), None, up, POINT, probes) == (0, 1, 2, 3)
-    assert rest_frames(_records(poses), 99, up, POINT, probes) == ()
+    for named in (1, None):
+        found = rest_frames(_records(poses), named, up, POINT, probes)
+        assert list(found) == [0, 1, 2, 3] and min(found.values()) > 0.99
+    assert rest_frames(_records(poses), 99, up, POINT, probes) == {}
+
+
+def test_the_weight_of_a_rest_frame_falls_to_zero_with_its_motion():
+    poses, _ = _take()
+    up, probes = np.array([0.0, 1.0, 0.0]), POINT + np.random.default_rng(2).normal(size=(30, 3)) * 10
+    weights = []
+    for moved_mm in np.linspace(0, 0.13, 14):
+        poses[3, 1] = poses[3, 0] @ translation([0, -moved_mm, 0])
+        weights.append(rest_frames(_records(poses), 1, up, POINT, probes).get(3, 0.0))
+    assert weights[0] > 0.99 and weights[-1] == 0
+    assert (np.diff(weights) <= 0).all() and np.diff(weights).min() > -0.2
+
+
+def test_a_frame_at_the_limit_of_rest_does_not_change_the_result():
+    poses, covariance = _take(steady=((0,) * 6, (0, 0, 0, 0, -0.1, 0)))
+    poses[3, 1] = poses[3, 1] @ translation([0, -0.12, 0])
+    with_it, without = (
+        closed_bite(FRAMES, poses, *_parts(covariance), replace(REST, weights={0: 1.0, 1: 0.8} | more))
+        for more in ({3: 1e-6}, {})
+    )
+    assert np.abs(with_it.steady - without.steady).max() < 1e-6
+
+
+def test_one_frame_with_closed_teeth_is_enough():
+    poses, covariance = _take(steady=((0,) * 6, (0, 0, 0, 0, -0.1, 0)))
+    bite = closed_bite(FRAMES, poses, *_parts(covariance), replace(REST, weights={1: 1.0}))
+    assert bite.frames == (1,)
+    assert bite.steady[1, 4] == pytest.approx(-0.05, abs=0.02)
 
 
 @pytest.mark.parametrize(("named", "words"), [(True, "rest_frame is not tracked"), (False, "no frame shows")])
 def test_a_take_without_a_closed_bite_has_a_note(named, words):
-    found = registration_unknown(RestFrames((), named, POINT, POINT, False))
+    found = registration_unknown(RestFrames({}, named, POINT, POINT, False))
     assert found.kind == "registration_unknown" and found.severity == "note" and words in found.message
 
 
 def test_without_rest_frames_there_is_no_result():
     poses, covariance = _take()
-    poses[:3] = np.nan
+    poses[:4] = np.nan
     assert closed_bite(FRAMES, poses, *_parts(covariance), REST) is None

@@ -159,8 +159,8 @@ def tracks_of(
     solved = [(frame, found, found.solution) for frame, found in followed.items() if found.solution is not None]
     records = {frame: _record(found, solution, config) for frame, found, solution in solved}
     point = np.mean([scan.centre for scan in take.scans], axis=0)
-    frames = rest_frames(records, take.rest_frame, take.axes[1], point, take.scans[1].probes)
-    rest = RestFrames(frames, take.rest_frame is not None, point, take.scans[1].centre, take.registers)
+    weights = rest_frames(records, take.rest_frame, take.axes[1], point, take.scans[1].probes)
+    rest = RestFrames(weights, take.rest_frame is not None, point, take.scans[1].centre, take.registers)
     middle = np.median([record.solution.centres for record in records.values()], axis=(0, 1))
     extrinsics = Extrinsics.calibrated(take.cameras, middle)
     variance = outline_variance(records, config)

@@ -27,7 +27,8 @@ from jawusd.tracking.sequence.extrinsics import Extrinsics
 from jawusd.tracking.sequence.nuisance import TakeEquations, pose_response
 
 # Criteria for frames in which the teeth rest in contact: maximum relative motion of the arches [mm/frame at the teeth],
-# and maximum distance from the relative pose in the named frame or the frame with the smallest opening [mm].
+# and maximum distance from the relative pose in the named frame or the frame with the smallest opening [mm]. Weights
+# fall to zero at both limits, so that a frame at a limit does not change the result.
 _STILL_MM, _SAME_BITE_MM = 0.12, 0.2
 _LONGEST_REST = 24  # maximum number of rest frames used on either side; more would add no information
 
@@ -36,7 +37,7 @@ _LONGEST_REST = 24  # maximum number of rest frames used on either side; more wo
 class RestFrames:
     """Frames with closed teeth, and whether they are used to correct the position of the lower scan."""
 
-    frames: tuple[int, ...]  # frame numbers
+    weights: Mapping[int, float]  # weight of every such frame, above 0, at most 1
     named: bool  # whether the capture specifies one of the frames
     point: Array  # centre of the teeth in scan coordinates [mm], shape (3,)
     lower: Array  # centre of the lower crowns in scan coordinates [mm], shape (3,)
@@ -45,8 +46,8 @@ class RestFrames:
 
 def rest_frames(
     records: Mapping[int, FrameRecord], named: int | None, up: Array, point: Array, probes: Array
-) -> tuple[int, ...]:
-    """Return the frames in which the teeth rest together, around a named frame or the frame with the smallest opening.
+) -> dict[int, float]:
+    """Return weights of the frames in which the teeth rest together, around one that is named or most closed.
 
     Args:
         named: frame named in the capture, or None.
@@ -57,24 +58,33 @@ def rest_frames(
     if named is None:
         closed = {f: float((T[:3, :3] @ point + T[:3, 3] - point) @ up) for f, T in relative.items()}
         ranked = sorted(closed, key=lambda f: -closed[f])
-        named = next((f for f in ranked if _still(relative, f, f + 1, probes)), None)
+        named = next((f for f in ranked if _stillness(relative, f, f + 1, probes)), None)
     if named is None or named not in relative:
-        return ()
-    out = [named]
+        return {}
+    weights = {named: 1.0}
     for step in (1, -1):
-        frame = named
-        while abs(frame + step - named) <= _LONGEST_REST and _still(relative, frame, frame + step, probes):
+        frame, weight = named, 1.0
+        while abs(frame + step - named) <= _LONGEST_REST:
+            weight = min(weight, _stillness(relative, frame, frame + step, probes))
             frame += step
-            if _moved_mm(relative[frame], relative[named], probes) > _SAME_BITE_MM:
+            if weight:
+                weight = min(weight, _bisquare(_moved_mm(relative[frame], relative[named], probes) / _SAME_BITE_MM))
+            if not weight:
                 break
-            out.append(frame)
-    return tuple(sorted(out))
+            weights[frame] = weight
+    return dict(sorted(weights.items()))
 
 
-def _still(relative: Mapping[int, Array], frame: int, other: int, probes: Array) -> bool:
+def _stillness(relative: Mapping[int, Array], frame: int, other: int, probes: Array) -> float:
+    """Return the weight of a frame for the motion of the lower arch from one beside it; 0 if one is not tracked."""
     if frame not in relative or other not in relative:
-        return False
-    return _moved_mm(relative[frame], relative[other], probes) < _STILL_MM
+        return 0.0
+    return _bisquare(_moved_mm(relative[frame], relative[other], probes) / _STILL_MM)
+
+
+def _bisquare(ratio: float) -> float:
+    """Return the weight of a deviation, given as a fraction of the limit at which it is 0 (Beaton & Tukey 1974)."""
+    return float((1.0 - min(ratio, 1.0) ** 2) ** 2)
 
 
 def _moved_mm(one: Array, other: Array, probes: Array) -> float:
@@ -89,7 +99,6 @@ _DEGREES_OF_FREEDOM = 4.0  # of this distribution: about 1 % of registrations ar
 #: Fraction of the outline error variance that is constant over a take, in addition to annotator bias [-]: if it were
 #: larger, noise in a few frames with closed teeth would shift the whole take.
 STEADY = 0.3
-_FEWEST_FRAMES = 2
 # Effective number of independent measurements per frame with closed teeth, and maximum for all such frames:
 # neighbouring frames have nearly the same outline error.
 _NEW_PER_FRAME, _MOST_FRAMES = 0.25, 3.0
@@ -168,7 +177,7 @@ class ClosedBite:
 def closed_bite(
     frames: NDArray[np.int64], poses: Array, outline: Array, habits: Array, rest: RestFrames
 ) -> ClosedBite | None:
-    """Attribute the deviation from occlusion in the rest frames to its causes; None with too few tracked rest frames.
+    """Attribute the deviation from occlusion in the rest frames to its causes; None if no rest frame is tracked.
 
     Args:
         frames: frame numbers, shape (F,).
@@ -178,13 +187,14 @@ def closed_bite(
     """
     point = rest.point
     known = np.asarray(np.isfinite(poses).all((1, 2, 3)) & np.isfinite(outline).all((1, 2, 3)), bool)
-    used = np.asarray(known & np.isin(frames, rest.frames), bool)
-    count = int(used.sum())
-    if count < _FEWEST_FRAMES:
+    weights = np.array([rest.weights.get(frame, 0.0) for frame in frames.tolist()])
+    used = np.asarray(known & (weights > 0), bool)
+    if not used.any():
         return None
+    weights = weights[used]
     there, back = translation(point), translation(-point)
     relative = relative_pose(poses[used, 0], poses[used, 1])
-    found = se3_log(back @ relative @ there).mean(0)
+    found = np.average(se3_log(back @ relative @ there), axis=0, weights=weights)
 
     def local(covariance: Array, at: Array) -> Array:
         A = se3_adjoint(back @ se3_inverse(at.reshape(-1, 4, 4))).reshape(-1, 2, 6, 6)
@@ -193,8 +203,10 @@ def closed_bite(
     usual = np.flatnonzero(known)[:: max(1, int(known.sum()) // _USUAL_FRAMES)]
     steady = local(STEADY * outline[usual] + habits[usual], poses[usual])
     upper, lower = (_positive(part) for part in np.median(steady, axis=0))
-    independent = min(1.0 + _NEW_PER_FRAME * (count - 1), _MOST_FRAMES)
-    noise = (1.0 - STEADY) / independent * local(outline[used], poses[used]).mean(0).sum(0)
+    count = weights.sum() ** 2 / (weights**2).sum()  # effective number of frames (Kish 1965)
+    independent = min(1.0 + _NEW_PER_FRAME * (count - 1.0), _MOST_FRAMES)
+    single = np.average(local(outline[used], poses[used]), axis=0, weights=weights).sum(0)
+    noise = (1.0 - STEADY) / independent * single
     both = upper + lower
     prior = _registration_spread(found, both + noise)
     gain = np.linalg.inv(both + noise + prior)
@@ -264,8 +276,8 @@ def observe_bite(
     variance_px3: Array,
 ) -> None:
     """Add the observation that the teeth are closed: outline biases that separate the teeth become unlikely."""
-    used = [f for f in rest.frames if f in records and records[f].found.all()]
-    if len(used) < _FEWEST_FRAMES:
+    used = {f: w for f, w in rest.weights.items() if f in records and records[f].found.all()}
+    if not used:
         return
     there, back = translation(rest.point), translation(-rest.point)
     found, slopes, spread = [], [], []
@@ -278,9 +290,10 @@ def observe_bite(
         slopes.append(lower - upper)
         H = solution.outline.precision.sum(1) / variance_px3[:, None, None]
         spread.append(np.sum([to_skull[r] @ np.linalg.pinv(H[r]) @ to_skull[r].T for r in ARCHES], axis=0))
-    deviation, slope, outline = np.mean(found, axis=0), np.mean(slopes, axis=0), np.mean(spread, axis=0)
+    weights = np.array([*used.values()])
+    deviation, slope, outline = (np.average(part, axis=0, weights=weights) for part in (found, slopes, spread))
     bite = _registration_spread(deviation, outline + slope @ equations.prior_covariance() @ slope.T)
-    equations.observe(slope, deviation, np.linalg.inv(outline + bite))
+    equations.observe(slope, deviation, np.asarray(np.linalg.inv(outline + bite), np.float64))
 
 
 def _registration_spread(found: Array, others: Array) -> Array:

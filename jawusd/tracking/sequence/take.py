@@ -91,9 +91,9 @@ def track_capture(
                 take.track_from(start.frame, start.poses, lost)
             point = np.mean([scan.centre for scan in scans], axis=0)
             named, up = capture.motion.rest_frame, start.T_anatomical_scan[1, :3]
-            frames = rest_frames(take.records, named, up, point, scans[1].probes)
+            weights = rest_frames(take.records, named, up, point, scans[1].probes)
             corrects = capture.scans.registration == "take"
-            rest = RestFrames(frames, named is not None, point, scans[1].centre, corrects)
+            rest = RestFrames(weights, named is not None, point, scans[1].centre, corrects)
             shifts = frame_shifts(take.records, masks, solver)
             given = take.scans_and_lenses(start.T_anatomical_scan[0, :3])
             wrong = any(finding.kind in _SHOWN_AS_MOTION for finding in given)
@@ -205,9 +205,9 @@ class _Take(Passes):
         if not whole:
             return found, extrinsics
         chosen = {whole[k] for k in np.linspace(0, len(whole) - 1, c.settle_frames).astype(int)}
-        chosen |= set(rest.frames[:_SETTLED_REST]) & set(whole)
+        chosen |= set(sorted(rest.weights, key=lambda f: -rest.weights[f])[:_SETTLED_REST]) & set(whole)
         sample = {frame: self._masks.at(frame) for frame in sorted(chosen)}
-        sampled_rest = replace(rest, frames=tuple(f for f in rest.frames if f in sample))
+        sampled_rest = replace(rest, weights={f: w for f, w in rest.weights.items() if f in sample})
         variance = outline_variance(records, c)
         for _ in range(c.settle_rounds):
             if cameras_moved:
