@@ -91,7 +91,7 @@ class RigArrays:
     def error_growth(self) -> Array:
         """Error of the model at its landmarks, from held-out frames, shape (n, 2); 0 if unknown.
 
-        The columns are the error near captured poses [mm], and its growth with the distance from them [mm/mm].
+        The columns are the error near captured poses [mm], and its growth per mm far from them [mm/mm].
         """
         known = self.meta.get("uncertainty")
         if not isinstance(known, dict) or len(self.landmarks) != len(LANDMARKS):

@@ -34,7 +34,7 @@ from jawusd.fitting.data import (  # noqa: E402
 )
 from jawusd.formats.capture import load_capture  # noqa: E402
 from jawusd.formats.tracks import load_tracks  # noqa: E402
-from jawusd.geometry import LANDMARKS, make_transform, se3_exp, se3_log, so3_exp, transform_point  # noqa: E402
+from jawusd.geometry import make_transform, se3_exp, se3_log, so3_exp, transform_point  # noqa: E402
 from jawusd.paper.model import fit_paper  # noqa: E402
 from jawusd.paper.nlpca import train_nlpca  # noqa: E402
 from jawusd.pipeline.subject import load_meshes, subject_of_capture  # noqa: E402
@@ -81,7 +81,7 @@ def one_person(seed: int, envelope: str) -> None:
     values = np.linalg.svd(moved.reshape(len(d), -1, 3), compute_uv=False)
     swept = sweeps(rig)
     off = subject.possible.nearest(rig.pose(swept))[1]
-    within = covered(subject, rig, model.meta["uncertainty"])
+    within = covered(subject, rig)
     print(
         f"{envelope:<10} {seed}   {back:12.1e} mm {(values[:, 0] / values[:, 2]).max():9.2f}   "
         f"{100 * (off <= 1).mean():10.2f} % {off.max():9.2f} mm   {100 * within.mean():8.1f} % "
@@ -110,13 +110,11 @@ def sweeps(rig: JawRig) -> np.ndarray:
     return np.concatenate(found)
 
 
-def covered(subject: Subject, rig: JawRig, uncertainty: dict) -> np.ndarray:
+def covered(subject: Subject, rig: JawRig) -> np.ndarray:
     """Return the share of hidden errors within two predicted standard deviations, per landmark, shape (5,)."""
     d = rig.encode(subject.hidden)[0]
-    distance, near = rig.captured_distance(d), rig.pose(d)
-    shares = []
-    for name, point in zip(LANDMARKS, subject.person.landmarks, strict=True):
-        sd = uncertainty[name]["base_mm"] + uncertainty[name]["per_mm"] * distance
+    near, shares = rig.pose(d), []
+    for sd, point in zip(rig.landmark_sigma_mm(d).T, subject.person.landmarks, strict=True):
         error = np.linalg.norm(transform_point(near, point) - transform_point(subject.hidden, point), axis=-1)
         shares.append((error <= 2 * sd).mean())
     return np.array(shares)

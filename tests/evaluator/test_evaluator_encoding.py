@@ -182,7 +182,8 @@ def test_error_of_a_rig_grows_with_the_distance_from_captured_poses(rig):
     unsure = JawRig(rig.arrays, {**rig.meta, "uncertainty": table})
     d = unsure.captured_d[:1] + np.array([[0.0, 0.0, 0.0], [40.0, 0.0, 0.0], [80.0, 0.0, 0.0]])
     sigma = unsure.landmark_sigma_mm(d)
-    np.testing.assert_allclose(sigma, 0.2 * unsure.captured_distance(d)[:, None] * np.ones(5))
+    distance = unsure.captured_distance(d)[:, None]
+    np.testing.assert_allclose(sigma, 0.2 * distance**2 / (distance + 3.0) * np.ones(5))
     assert not unsure.pose_covariance(d[0]).any() and not unsure.parameter_covariance(d[0]).any()
     variance = np.einsum("nii->n", unsure.parameter_covariance(d))
     assert variance[0] == 0.0 < variance[1] < variance[2]

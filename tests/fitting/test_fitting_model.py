@@ -72,6 +72,13 @@ def test_training_and_held_out_errors_are_small_and_reported(model):
     assert tables["train"]["incisor"]["mean"] < tables["train"]["condyle_left"]["mean"] < 0.3
 
 
+def errors_at_landmarks(person, rig, T):
+    """Return the distances of the landmarks between poses (n, 4, 4) and their encoded versions (n, 5) [mm]."""
+    near = rig.pose(rig.encode(T)[0])
+    points = [transform_point(near, point) - transform_point(T, point) for point in person.landmarks]
+    return np.linalg.norm(points, axis=-1).T
+
+
 def test_reported_training_error_is_that_of_the_rig(model, rig, person, take):
     measured = largest_error(person, rig, take[model.trained])
     assert measured.mean() == pytest.approx(model.meta["errors"]["train"]["mandible"]["mean"], rel=0.03)
@@ -88,13 +95,8 @@ def test_unseen_exercises_stay_near_the_floor_of_any_three_parameter_model(perso
 def test_predicted_uncertainty_covers_errors_on_unseen_exercises(person, model, rig):
     hidden = record(person, 600, 2, "hidden").T_noisy
     d = rig.encode(hidden)[0]
-    distance, near = rig.captured_distance(d), rig.pose(d)
-    inside = []
-    for name, point in zip(LANDMARKS, person.landmarks, strict=True):
-        sure = model.meta["uncertainty"][name]
-        assert sure["per_mm"] > 0
-        error = np.linalg.norm(transform_point(near, point) - transform_point(hidden, point), axis=-1)
-        inside.append((error <= 2 * (sure["base_mm"] + sure["per_mm"] * distance)).mean())
+    assert all(model.meta["uncertainty"][name]["per_mm"] > 0 for name in LANDMARKS)
+    inside = (errors_at_landmarks(person, rig, hidden) <= 2 * rig.landmark_sigma_mm(d)).mean(axis=0)
     assert min(inside) >= 0.9 and np.mean(inside) <= 0.985
 
 
@@ -103,10 +105,7 @@ def test_predicted_uncertainty_of_a_short_take_is_neither_zero_nor_dominated_by_
     subject = Person(seed)
     model = fit(subject, record(subject, 96, seed).T_noisy, FittingConfig())
     short, hidden = JawRig(model.arrays, model.meta), record(subject, 300, seed + 10, "hidden").T_noisy
-    d = short.encode(hidden)[0]
-    near = short.pose(d)
-    points = [transform_point(near, point) - transform_point(hidden, point) for point in subject.landmarks]
-    ratio = np.linalg.norm(points, axis=-1).T / short.landmark_sigma_mm(d)
+    ratio = errors_at_landmarks(subject, short, hidden) / short.landmark_sigma_mm(short.encode(hidden)[0])
     assert np.all(np.abs(np.log(np.sqrt((ratio**2).mean(0)))) < np.log(3.5))
 
 
