@@ -7,20 +7,16 @@ from dataclasses import replace
 
 import numpy as np
 
-from jawusd.base.arrays import Array
-from jawusd.geometry import transform_points
 from jawusd.tracking.contour.equations import translation
 from jawusd.tracking.contour.views import View
 from jawusd.tracking.initialization.pose_search import shift_to_masks
-from jawusd.tracking.performance.attempts import Attempts, FrameFit, Instant, empty_fit
+from jawusd.tracking.performance.attempts import Attempts, FrameFit, Instant, Trial, empty_fit
 from jawusd.tracking.performance.coordinates import Pose
 from jawusd.tracking.performance.instant import Expected
 from jawusd.tracking.performance.motion import STEADY, Prediction
+from jawusd.tracking.performance.single_start import spread_out
 
-_KEPT_JAWS = 12  # maximum number of jaw poses remembered as starts after a loss
-# minimum distance of the lower incisal point between remembered poses: the solver converges from this distance
-_APART_MM = 3.0
-_FINALISTS = 3
+_JAWS, _FINALISTS = 32, 3  # numbers of jaw poses tried briefly, and of starts tried fully
 
 
 class ForwardPass:
@@ -30,14 +26,14 @@ class ForwardPass:
         """Continue from the fit of a frame; with a fixed head, only the jaw moves."""
         self._attempts, self._coordinates = attempts, attempts.instants.coordinates
         self._motion = Prediction(self._coordinates, begin.pose, begin.found, head=STEADY if fixed_head else 1.0)
-        self._jaws: list[Array] = []
-        self._remember(begin)
+        self._jaws = spread_out(self._coordinates.jaw, _JAWS)
+        attempts.remember(begin)
 
     def step(self, views: Sequence[View]) -> FrameFit:
         """Align the next frame."""
         fit = self._fit(self._motion.expected(), self._attempts.instant(views))
         self._motion.take(fit.pose, fit.found)
-        self._remember(fit)
+        self._attempts.remember(fit)
         return fit
 
     def _fit(self, expected: Expected, instant: Instant) -> FrameFit:
@@ -51,7 +47,7 @@ class ForwardPass:
         trial = attempts.without_wrong_masks(trial, expected, instant)
         if not attempts.bad(trial).any():
             return attempts.judged(trial, instant)
-        for start in self._other_starts(expected, instant):
+        for start in self._other_starts(trial, expected, instant):
             around = replace(expected, pose=start)
             other = attempts.attempt(start, around, instant, instant.present, config.wide_gates_px)
             if other.objective(config.uncovered_price) > trial.objective(config.uncovered_price):
@@ -65,32 +61,29 @@ class ForwardPass:
         alone = attempts.attempt(expected.pose, expected, instant, fit.use, config.wide_gates_px)
         return attempts.judged(alone, instant)
 
-    def _other_starts(self, expected: Expected, instant: Instant) -> list[Pose]:
-        """Return further starts: the prediction, the last pose, and earlier jaw poses moved onto the masks."""
-        jaws = [expected.pose.d, *(self._jaws if self._motion.blind.any() else ())]
+    def _other_starts(self, trial: Trial, expected: Expected, instant: Instant) -> list[Pose]:
+        """Return further starts: the prediction, the last pose, and the best of jaw poses over the whole range.
+
+        The head is that of the trial if the upper teeth fit, else the expected one, moved onto the masks.
+        """
+        jaws = [expected.pose.d, *self._jaws]
+        if trial.use[0].any() and not self._attempts.bad(trial)[0]:
+            poses = [replace(trial.pose, d=d) for d in jaws]
+        else:
+            poses = [self._onto_masks(replace(expected.pose, d=d), instant) for d in jaws]
+        scores = [self._score(pose, expected, instant) for pose in poses]
+        best = [poses[k] for k in np.argsort(scores)[::-1][:_FINALISTS]]
+        return [expected.pose, self._motion.last, *best]
+
+    def _onto_masks(self, pose: Pose, instant: Instant) -> Pose:
+        """Return the pose, moved in the image so that an arch is centred on its masks."""
         arch = 0 if instant.present[0].any() else 1
-        scan, shifted = self._attempts.instants.solver.scans[arch], []
-        for d in jaws:
-            pose = replace(expected.pose, d=d)
-            shift = shift_to_masks(scan, self._coordinates.arches(pose)[arch], arch, instant.views, instant.present)
-            shifted.append(replace(pose, head=translation(shift) @ pose.head))
-        if len(shifted) > _FINALISTS:
-            scores = [self._score(pose, expected, instant) for pose in shifted]
-            shifted = [shifted[k] for k in np.argsort(scores)[::-1][:_FINALISTS]]
-        return [expected.pose, self._motion.last, *shifted]
+        scan, at = self._attempts.instants.solver.scans[arch], self._coordinates.arches(pose)[arch]
+        shift = shift_to_masks(scan, at, arch, instant.views, instant.present)
+        return replace(pose, head=translation(shift) @ pose.head)
 
     def _score(self, start: Pose, expected: Expected, instant: Instant) -> float:
         """Return the objective of a start pose after a few alignment steps [px]."""
         config, around = self._attempts.config, replace(expected, pose=start)
         trial = self._attempts.attempt(start, around, instant, instant.present, config.trial_gates_px)
         return trial.objective(config.uncovered_price)
-
-    def _remember(self, fit: FrameFit) -> None:
-        """Update the usual residual; keep the jaw pose as a later start if it differs from the poses kept so far."""
-        self._attempts.remember(fit)
-        if not fit.found.all():
-            return
-        jaw = self._coordinates.jaw
-        place, *known = (transform_points(jaw.pose(d), jaw.landmarks[:1]) for d in (fit.pose.d, *self._jaws))
-        if all(np.linalg.norm(place - other) > _APART_MM for other in known):
-            self._jaws = [*self._jaws[-_KEPT_JAWS + 1 :], fit.pose.d]
