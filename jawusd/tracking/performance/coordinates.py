@@ -45,11 +45,15 @@ class Coordinates:
         jaw: the subject's rig.
         pivot: point of the upper scan about which the head rotates [mm], shape (3,).
         closed_mm: smallest captured opening d1, at most that of the closed bite.
+        rig_error: covariance (6, 6) of the rig's own error at a captured pose of medium opening, the prior of misfits.
+            That at the pose itself grows outside the captured poses, where a misfit would replace a deviation of d.
     """
 
     def __init__(self, jaw: JawRig, scans: Sequence[Scan]) -> None:
         self.jaw, self.pivot, self._lower_centre = jaw, scans[0].centre, scans[1].centre
         self.closed_mm = min(0.0, float(jaw.captured_d[:, 0].min(initial=0.0)))
+        captured = jaw.captured_d[np.argsort(jaw.captured_d[:, 0], kind="stable")]
+        self.rig_error = jaw.pose_covariance(captured[len(captured) // 2] if len(captured) else np.zeros(3))
         self._to_pivot = make_transform(np.eye(3), -self.pivot)
         self._from_pivot = make_transform(np.eye(3), self.pivot)
 

@@ -59,20 +59,16 @@ class Misfit:
         pose: Pose,
         sums: tuple[Array, Array],
         coupling: Array,
-        of_rig: Array | None = None,
     ) -> None:
         """Eliminate the misfit at a pose.
 
         Args:
             sums: precision (6, 6) and gradient (6,) of the lower arch's twist, as in `Coordinates.slopes`.
             coupling: block of the normal matrix that couples this twist with the unknowns, shape (6, N).
-            of_rig: covariance of the rig's own error, shape (6, 6); default: at the pose.
         """
         precision, gradient = sums
-        if of_rig is None:
-            of_rig = coordinates.jaw.pose_covariance(pose.d)
         self._slope, self._coupling = coordinates.error_slope(pose), coupling
-        prior, offset = self._slope @ of_rig @ self._slope.T, self._slope @ pose.misfit
+        prior, offset = self._slope @ coordinates.rig_error @ self._slope.T, self._slope @ pose.misfit
         kept = np.linalg.inv(np.eye(6) + precision @ prior)
         self.precision, self._spread = kept @ precision, prior @ kept
         self._gradient = gradient + precision @ offset  # at zero misfit
@@ -120,10 +116,9 @@ class InstantSolver:
         """
         rendering = rendering or self.solver.rendering(views)
         pose, left, moved_mm = start, tuple(gates_px), np.inf
-        of_rig = self.coordinates.jaw.pose_covariance(start.d)
         while left:
             state = self.linearise(pose, views, use, rendering, left[0])
-            matrix, right, misfit = self.equations(pose, state, outline_weight, of_rig)
+            matrix, right, misfit = self.equations(pose, state, outline_weight)
             away = self.coordinates.step(expected.pose, pose)
             pulled = right - expected.precision * away
             step = np.asarray(np.linalg.solve(matrix + np.diag(expected.precision), pulled), np.float64)
@@ -147,21 +142,19 @@ class InstantSolver:
         """Match the outlines at a pose and accumulate their normal equations; see `ContourSolver.linearise`."""
         return self.solver.linearise(self.coordinates.arches(pose), views, use, gate, rendering, final, matched)
 
-    def equations(self, pose: Pose, state: Solution, outline_weight: Array, of_rig: Array | None = None) -> Equations:
-        """Return the equations of a step, from matched outlines and the rig's bound; `of_rig` is as for `Misfit`."""
+    def equations(self, pose: Pose, state: Solution, outline_weight: Array) -> Equations:
+        """Return the equations of a step, from matched outlines and the rig's bound."""
         matrix, right = bound_equations(self.coordinates, pose.d)
-        outlines = self.outline_equations(pose, state, outline_weight, of_rig)
+        outlines = self.outline_equations(pose, state, outline_weight)
         return Equations(matrix + outlines.matrix, right + outlines.right, outlines.misfit)
 
-    def outline_equations(
-        self, pose: Pose, state: Solution, outline_weight: Array, of_rig: Array | None = None
-    ) -> Equations:
+    def outline_equations(self, pose: Pose, state: Solution, outline_weight: Array) -> Equations:
         """Return the part of `equations` from matched outlines."""
         outline, slopes = state.outline, self.coordinates.slopes(pose)
         precision = [outline_weight[r] * outline.precision[r].sum(0) for r in ARCHES]
         gradient = [outline_weight[r] * outline.gradient[r].sum(0) for r in ARCHES]
         coupling = precision[1] @ slopes[1]
-        misfit = Misfit(self.coordinates, pose, (precision[1], gradient[1]), coupling, of_rig)
+        misfit = Misfit(self.coordinates, pose, (precision[1], gradient[1]), coupling)
         return Equations(
             slopes[0].T @ precision[0] @ slopes[0] + slopes[1].T @ coupling + misfit.matrix,
             slopes[0].T @ gradient[0] + slopes[1].T @ gradient[1] + misfit.right,
