@@ -192,6 +192,35 @@ def test_a_jaw_that_the_rig_cannot_reproduce_moves_no_head(jaw, scans, truth, tm
     assert found[0] < 0.25 < 0.5 < found[1], found
 
 
+@pytest.mark.parametrize("step_mm", [3.0, 6.0, 9.0])
+def test_a_jaw_that_moves_far_to_the_second_frame_is_found(jaw, scans, truth, tmp_path, step_mm):
+    """Lips cover parts of the teeth, so that the centres of teeth and masks are apart."""
+    d, head = truth[0].copy(), truth[1]
+    d[1:, 0] += step_mm
+    folder = write_masks(tmp_path, jaw, (d, head), small_take.CAMERAS[:1])
+    for path in sorted(folder.rglob("*.png")):
+        mask = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+        upper, rows = path.parent.name == "upper", np.nonzero(mask)[0]
+        covered = slice(0, int(np.quantile(rows, 0.4))) if upper else slice(int(np.quantile(rows, 0.6)), None)
+        mask[covered] = 0
+        cv2.imwrite(str(path), mask)
+    found = solved(jaw, scans, (d, head), folder, small_take.CAMERAS[:1], off_mm=0.2)
+    assert (found.state[seen()] == SolveState.SOLVED).all()
+    assert tip_error_mm(jaw, found, (d, head))[seen()].max() < 0.8
+
+
+def test_a_jaw_far_outside_the_bound_is_measured_by_d(jaw, scans, truth, tmp_path):
+    """The stated error of the rig, which is large there, lets no misfit replace the deviation of d."""
+    d, head = truth[0].copy(), truth[1]
+    d[:, (0, 2)] += np.array([14.0, 10.0]) * np.exp(-(((np.arange(COUNT)[:, None] - 6.0) / 3.0) ** 2))
+    table = {name: {"base_mm": 0.05, "per_mm": 0.5} for name in LANDMARKS}
+    unsure = JawRig(jaw.arrays, {**jaw.meta, "uncertainty": table})
+    folder = write_masks(tmp_path, jaw, (d, head), small_take.CAMERAS)
+    found = solved(unsure, scans, (d, head), folder, small_take.CAMERAS)
+    assert unsure.margin(d[6]) < -5
+    assert tip_error_mm(jaw, found, (d, head))[4:9].max() < 0.2
+
+
 def test_skin_measures_the_jaw_while_one_camera_sees_no_teeth(jaw, scans, truth, tmp_path):
     """Skin with an unknown offset, and two strange faces with a large error; half of the frames show no teeth."""
     hidden, strange = np.arange(6, 20), np.array([11, 12])

@@ -223,7 +223,8 @@ def test_a_misfit_is_eliminated_as_the_full_system_would(jaw):
     gradient, of_rig = rng.normal(size=6), np.diag(rng.uniform(0.1, 1.0, 6))
     coupling, left = precision @ slope, rng.normal(size=unknowns)
     own = slope.T @ coupling + np.eye(unknowns)
-    misfit = Misfit(coordinates, pose, (precision, gradient), coupling, of_rig)
+    coordinates.rig_error = of_rig
+    misfit = Misfit(coordinates, pose, (precision, gradient), coupling)
     step = np.linalg.solve(own + misfit.matrix, left + misfit.right)
     cross = coupling.T @ error
     full = np.block([[own, cross], [cross.T, error.T @ precision @ error + np.linalg.inv(of_rig)]])
