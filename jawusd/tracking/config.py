@@ -73,7 +73,7 @@ class TrackingConfig:
     # Assumed correlation length of outline errors along the contour [px], until it is measured on the take.
     correlation_px: float = 18.0
     known_correlation_px: float | None = None  # known correlation length of outline errors [px]; None: measured
-    # Smooth outline errors of masks; None: errors of neighbouring samples are independent.
+    # Smooth outline errors; None: errors of neighbouring samples are independent.
     smooth_errors: SmoothErrors | None = SmoothErrors()
     # Side of the tiles over which errors are summed to measure it [px]: estimates change little from 20 to 45.
     tile_px: int = 30

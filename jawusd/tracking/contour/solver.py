@@ -120,7 +120,7 @@ class ContourSolver:
         poses, iterations, moved_mm = self._descended(poses, tuple(gates_px), *given)
         gate = gates_px[-1] if gates_px else self.config.final_gate_px[1]
         state = self.linearise(poses, views, use, gate, rendering, final=True)
-        if moved_mm < _CONVERGED_MM and self._smooth_errors(views, gate):
+        if moved_mm < _CONVERGED_MM and self._smooth_errors(gate):
             # From the least-squares solution, one step of generalised least squares is enough (Le Cam's one-step
             # estimator; van der Vaart 1998, section 5.7).
             poses, _ = self._moved(poses, state, all_terms, outline_weight)
@@ -166,10 +166,9 @@ class ContourSolver:
         # Predictions multiply poses frame after frame, so rounding errors would accumulate.
         return orthonormalise(np.stack(moved)), self._motion_mm(step)
 
-    def _smooth_errors(self, views: Sequence[View], gate_px: float) -> SmoothErrors | None:
-        """Return the model of outline errors for a residual gate: only the last steps, with masks, have one."""
-        last = gate_px <= self.config.final_gate_px[1] and all(view.edges is None for view in views)
-        return self.config.smooth_errors if last else None
+    def _smooth_errors(self, gate_px: float) -> SmoothErrors | None:
+        """Return the model of outline errors for a residual gate: only the last steps have one."""
+        return self.config.smooth_errors if gate_px <= self.config.final_gate_px[1] else None
 
     def linearise(
         self,
@@ -207,7 +206,7 @@ class ContourSolver:
         scatters, gum_scatters, visible = np.zeros((2, 6, 6)), np.zeros((2, 6, 6)), np.zeros((2, len(views)))
         pull = config.pull if gate > config.pull_above_px else 0.0
         used = [gate, gate]
-        smooth = self._smooth_errors(views, gate) if final else None
+        smooth = self._smooth_errors(gate) if final else None
         if gate <= config.final_gate_px[1]:
             used = [self._final_gate([matches[t][1] for t in tasks if t[0] == r], gate) for r in ARCHES]
         for r, c in tasks:

@@ -26,7 +26,15 @@ from jawusd.tracking.region.rig_tracker import RigTracker
 
 _FACES = 3_000
 # The settings are coarser than for recorded images, since dropped frames reduce accuracy more than coarse settings.
-_SETTINGS = replace(TrackingConfig(), sample_step_px=3.0, redraw_px=4.0, parallax_px=6.0, settled_mm=0.4, judged_mm=0.3)
+_SETTINGS = replace(
+    TrackingConfig(),
+    sample_step_px=3.0,
+    redraw_px=4.0,
+    parallax_px=6.0,
+    settled_mm=0.4,
+    judged_mm=0.3,
+    smooth_errors=None,
+)
 
 
 class LiveTake:

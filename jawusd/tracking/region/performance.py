@@ -99,6 +99,7 @@ class PictureTake:
             sample_step_px=SAMPLE_STEP_PX,
             redraw_px=REDRAW_PX,
             settled_mm=_SETTLED_MM,
+            smooth_errors=None,
         )
         self._instants, self._rough = (
             InstantSolver(ContourSolver([thinned(scan, faces) for scan in scans], config), self.coordinates)

@@ -150,13 +150,14 @@ class PoseSearch:
             largest_zoom=_ZOOM,
         )
         self.solver = ContourSolver([replace(scan, thin=None) for scan in scans], self.config, executor)
-        self._thin = ContourSolver([thinned(scan, FACES) for scan in scans], self.config, executor)
+        quick = replace(self.config, smooth_errors=None)  # only refined alignments need the model of smooth errors
+        self._thin = ContourSolver([thinned(scan, FACES) for scan in scans], quick, executor)
         self.condyles = CondyleMotion(landmarks, axes)
         self._loose, self._firm = (CondyleTerm(self.condyles, noise) for noise in (_LOOSE_PX3, _FIRM_PX3))
         self._bite, self._axes = BiteTerm(landmarks[:3], axes[1], BORDER_PX3), axes
         # A variance times a length scales with the third power [px^3].
         coarse = replace(
-            self.config.with_gates_scaled(COARSE),
+            quick.with_gates_scaled(COARSE),
             redraw_px=COARSE * REDRAW_PX,
             typical_noise_px3=COARSE**3 * self.config.typical_noise_px3,
         )
