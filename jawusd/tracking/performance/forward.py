@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cached_property
 
 import numpy as np
 
+from jawusd.base.arrays import Array
 from jawusd.tracking.contour.equations import translation
 from jawusd.tracking.contour.views import View
 from jawusd.tracking.initialization.pose_search import shift_to_masks
@@ -26,7 +28,6 @@ class ForwardPass:
         """Continue from the fit of a frame; with a fixed head, only the jaw moves."""
         self._attempts, self._coordinates = attempts, attempts.instants.coordinates
         self._motion = Prediction(self._coordinates, begin.pose, begin.found, head=STEADY if fixed_head else 1.0)
-        self._jaws = spread_out(self._coordinates.jaw, _JAWS)
         attempts.remember(begin)
 
     def step(self, views: Sequence[View]) -> FrameFit:
@@ -35,6 +36,11 @@ class ForwardPass:
         self._motion.take(fit.pose, fit.found)
         self._attempts.remember(fit)
         return fit
+
+    @cached_property
+    def _jaws(self) -> Array:
+        """Jaw parameters over the whole range [mm], shape (n, 3); few walks need them."""
+        return spread_out(self._coordinates.jaw, _JAWS)
 
     def _fit(self, expected: Expected, instant: Instant) -> FrameFit:
         attempts, config = self._attempts, self._attempts.config
