@@ -145,7 +145,7 @@ def test_a_performance_is_found_and_carried_through_closed_lips(jaw, scans, trut
 
 def test_sigma_covers_what_a_biased_annotator_does_to_depth(jaw, scans, truth, tmp_path, monkeypatch):
     """One camera; outlines outside of the upper teeth and inside of the lower ones."""
-    folder = write_masks(tmp_path, jaw, truth, small_take.CAMERAS[:1], (1.3, -0.5))
+    folder = write_masks(tmp_path, jaw, truth, small_take.CAMERAS[:1], (1.1, -0.4))
 
     def z2():
         found = solved(jaw, scans, truth, folder, small_take.CAMERAS[:1])

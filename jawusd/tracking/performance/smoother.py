@@ -27,9 +27,9 @@ _FOCAL_ROUNDS = 6  # the same if focal lengths are unknown, since they are coupl
 # Maximum number of solutions of the linearised equations, each with the bound linearised at the previous one; change of
 # d below which no further one is computed [mm].
 _BOUND_ROUNDS, _SAME_MM = 5, 0.05
-#: Ratio of true to computed variance of a frame's unknowns without a model of smooth outline errors [-]: the equations
-#: then ignore that these persist over frames.
-WIDER = 1.5**2
+#: Ratio of true to computed variance of a frame's unknowns [-]: the equations ignore that outline errors persist over
+#: frames. With a model of smooth outline errors, fewer errors remain.
+WIDER, _WIDER_IF_SMOOTH = 1.5**2, 1.25**2
 # Standard deviations of the prior for aligning frames again in which an arch was missed [rad, mm, mm].
 _NEARBY = np.r_[[0.05] * 3, [3.0] * 3, [3.0] * 3]
 
@@ -73,7 +73,7 @@ class Smoother:
             annotator: prior on annotator bias; default: of hand-drawn masks.
             skin: jaw parameters estimated from facial skin in every frame.
         """
-        self._wider = WIDER if instants.config.smooth_errors is None else 1.0
+        self._wider = WIDER if instants.config.smooth_errors is None else _WIDER_IF_SMOOTH
         self._skin = None if skin is None else SkinFactor(skin, fps, self._wider)
         self._cameras, self._rounds, self._shared_px3 = cameras, _FOCAL_ROUNDS if free_focal else _ROUNDS, shared_px3
         if views is None:
