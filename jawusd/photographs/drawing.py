@@ -128,7 +128,7 @@ class Outlines:
 def split_teeth(scan: Scan, T_anatomical_scan: Array, arch: int) -> Crowns:
     """Return the crowns of a scan as connected pieces, given T_anatomical_scan (4, 4); `arch` is 0 upper, 1 lower.
 
-    For a scan without gum, faces along the middle of the arch are drawn as well: they occlude the far side.
+    In place of missing gum, faces along the middle of the arch hide the teeth behind them.
     """
     faces = scan.crown_faces
     pairs = (faces.ravel(), np.roll(faces, 1, axis=1).ravel())

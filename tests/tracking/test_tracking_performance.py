@@ -8,103 +8,22 @@ import cv2
 import numpy as np
 import pytest
 import small_take
-from bumpy_teeth import disturbed, jaw_poses, make_cameras, render_masks
-from example_model import LANDMARKS_ANATOMICAL, example_arrays, example_meta
+from rig_take import COUNT, HIDDEN, seen, solved, tip_error_mm, write_masks
 
 from jawusd.base.errors import TrackingError
 from jawusd.evaluator import JawRig
 from jawusd.evaluator.skin import SkinJaw
 from jawusd.formats.performance import SolveState
-from jawusd.geometry import LANDMARKS, relative_pose, se3_exp, transform_point, transform_points
+from jawusd.geometry import LANDMARKS, relative_pose, transform_point, transform_points
 from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.contour.annotator import DRAWN
 from jawusd.tracking.contour.equations import twist_between
-from jawusd.tracking.contour.scan import prepare_scan, teeth_centre
 from jawusd.tracking.contour.solver import ContourSolver
-from jawusd.tracking.contour.views import MaskViews, masked_sources
-from jawusd.tracking.initialization.footage import Footage
-from jawusd.tracking.performance import single_start, smoother
+from jawusd.tracking.performance import smoother
 from jawusd.tracking.performance.attempts import FrameFit
 from jawusd.tracking.performance.coordinates import JAW, LOCAL, Coordinates, Pose
 from jawusd.tracking.performance.instant import Equations, Expected, InstantSolver, bound_equations
-from jawusd.tracking.performance.shot import Shot, solve_performance
-from jawusd.tracking.performance.single_start import SingleStart
 from jawusd.tracking.performance.smoother import Smoother
-
-COUNT = 26
-HIDDEN = range(12, 16)  # lips closed
-
-
-@pytest.fixture(scope="module")
-def jaw():
-    same = {"T_anatomical_skull": np.eye(4), "T_rest": np.eye(4), "landmarks": LANDMARKS_ANATOMICAL}
-    return JawRig({**example_arrays(), **same}, example_meta())
-
-
-@pytest.fixture(scope="module")
-def scans():
-    return tuple(prepare_scan(mesh, row) for mesh, row in zip(small_take.MESHES, small_take.ROWS))
-
-
-@pytest.fixture(scope="module")
-def truth():
-    """The jaw parameters and the head of every frame."""
-    t = np.arange(COUNT)
-    d = np.column_stack([7.0 + 2.5 * np.sin(0.3 * t), 1.2 * np.sin(0.25 * t), 0.6 + 0.5 * np.cos(0.2 * t)])
-    return d, jaw_poses(COUNT)[:, 0]
-
-
-@pytest.fixture(scope="module")
-def folder(jaw, truth, tmp_path_factory):
-    """The masks of the take; none in the hidden frames."""
-    return write_masks(tmp_path_factory.mktemp("shot"), jaw, truth, small_take.CAMERAS)
-
-
-def write_masks(out, jaw, truth, cameras, grown_px=(0.0, 0.0), hidden=HIDDEN, misfits=None):
-    """Write the masks of the take, whose outlines lie `grown_px` outside of the upper and lower teeth.
-
-    `misfits` are twists of the mandible away from the rig's pose, by frame.
-    """
-    rng = np.random.default_rng(0)
-    for camera in cameras:
-        for row in small_take.ROWS:
-            (out / camera.name / row).mkdir(parents=True)
-        for k, (d, head) in enumerate(zip(*truth)):
-            if k in hidden:
-                continue
-            lower = head @ se3_exp((misfits or {}).get(k, np.zeros(6))) @ jaw.pose(d)
-            shown = small_take.MESHES, np.stack([head, lower]), camera, None, 0.3, rng
-            masks = {grown: render_masks(*shown, grown_px=grown) for grown in sorted(set(grown_px))}
-            for r, row in enumerate(small_take.ROWS):
-                mask = masks[grown_px[r]][r]
-                cv2.imwrite(str(small_take.png(out, camera.name, row, k)), (mask > 127).astype(np.uint8) * 255)
-    return out
-
-
-def solved(jaw, scans, truth, folder, cameras, off_mm=1.0, seed=4, **options):
-    """Solve the take with some cameras from a disturbed start."""
-    d, head = truth
-    names = [camera.name for camera in cameras]
-    capture = small_take.make_capture(
-        folder, COUNT, cameras=[small_take.source(folder, n) for n in names], bootstrap=None
-    )
-    start = np.stack([head[0], head[0] @ jaw.pose(d[0])])
-    start = disturbed(start, off_mm, 0.01, np.random.default_rng(seed))
-    table = {camera.name: camera for camera in cameras}
-    with MaskViews(capture.cameras, table, small_take.OFFSETS, teeth_centre(scans, start), 7.2, 1) as views:
-        frames = (small_take.FIRST, small_take.FIRST + COUNT)
-        pose = Coordinates(jaw, scans).pose_of(start)
-        shot = Shot(views, tuple(names), frames, small_take.FIRST, pose, 25.0, **options)
-        return solve_performance(jaw, scans, shot)
-
-
-def tip_error_mm(jaw, found, truth):
-    tip = jaw.landmarks[0]
-    return np.linalg.norm(transform_point(jaw.pose(found.d), tip) - transform_point(jaw.pose(truth[0]), tip), axis=-1)
-
-
-def seen():
-    return np.setdiff1d(np.arange(COUNT), HIDDEN)
 
 
 def test_slopes_are_what_steps_do(jaw, scans, truth):
@@ -358,70 +277,3 @@ def test_a_worn_camera_sees_one_head(jaw, scans, truth, tmp_path):
         still[1][0], scans[0].vertices
     )
     assert np.linalg.norm(head, axis=-1).max() < 0.5 and np.isfinite(found.covariance).all()
-
-
-def begun(jaw, scans, truth, folder, camera):
-    """Search for the start with one camera; return the step from the true pose of the frame found."""
-    source = small_take.source(folder, camera.name)
-    capture = small_take.make_capture(folder, COUNT, cameras=[source], bootstrap=None)
-    with_d = JawRig({**jaw.arrays, "codes": np.vstack([truth[0], [[2.0, 0, 0], [14.0, 1, 1]]])}, jaw.meta)
-    table = {camera.name: camera}
-    footage = Footage(
-        masked_sources(capture.cameras, table, small_take.OFFSETS, 1), table, small_take.OFFSETS, capture.frames, 1
-    )
-    search = SingleStart(small_take.MESHES, ContourSolver(scans, TrackingConfig()), with_d, np.eye(4))
-    found = search.find(footage)
-    k = found.frame - small_take.FIRST
-    return Coordinates(jaw, scans).step(Pose(truth[1][k], truth[0][k]), found.pose)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("turns", [0, 1])
-def test_one_camera_finds_where_to_begin(jaw, scans, truth, folder, tmp_path, turns):
-    """The camera may lie on its side."""
-    camera = small_take.CAMERAS[0]
-    turned_folder = shutil.copytree(folder, tmp_path / "turned")
-    for path in turned_folder.rglob("*.png"):
-        cv2.imwrite(str(path), np.rot90(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), turns))
-    away = begun(jaw, scans, truth, turned_folder, turned(camera, turns))
-    assert np.abs(away[:3]).max() < 0.03 and np.abs(away[3:]).max() < 1.5
-
-
-@pytest.mark.parametrize("turns", [1, 2, 3])
-def test_the_distances_tried_do_not_depend_on_how_the_camera_is_turned(folder, turns):
-    """The width of the teeth is measured along the arches, not along the rows of the image."""
-    camera, k = small_take.CAMERAS[0], small_take.START
-    masks = np.stack([cv2.imread(str(small_take.png(folder, camera.name, row, k)), 0) for row in ("upper", "lower")])
-    upright, sideways = (
-        single_start._places(
-            SimpleNamespace(
-                masks=np.rot90(masks, n, axes=(1, 2)), matrix=view.projection_matrix(), eye=view.centre_world()
-            )
-        )
-        for n, view in ((0, camera), (turns, turned(camera, turns)))
-    )
-    np.testing.assert_allclose(sideways, upright, atol=1.0)
-
-
-def turned(camera, turns):
-    """Return a camera turned about its axis, whose images are those of the given one after `np.rot90`."""
-    for _ in range(turns):
-        (width, height), K = camera.size_px, camera.K.copy()
-        K[[0, 1], [0, 1]], K[:2, 2] = camera.K[[1, 0], [1, 0]], (camera.K[1, 2], width - 1 - camera.K[0, 2])
-        quarter = np.array([[0.0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
-        camera = replace(camera, K=K, T_cam_world=quarter @ camera.T_cam_world, size_px=(height, width))
-    return camera
-
-
-@pytest.mark.slow
-def test_a_side_camera_finds_where_to_begin_from_half_of_the_teeth(jaw, scans, truth, tmp_path, monkeypatch):
-    """The centres of the masks lie far beside the front teeth; only one frame is searched."""
-    monkeypatch.setattr("jawusd.tracking.performance.single_start._MOST_TRIED", 1)
-    camera = make_cameras((45.0,))[0]
-    folder = write_masks(tmp_path, jaw, truth, [camera])
-    for path in folder.rglob("*.png"):
-        mask = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-        mask[:, : int(np.percentile(np.nonzero(mask)[1], 45))] = 0
-        cv2.imwrite(str(path), mask)
-    away = begun(jaw, scans, truth, folder, camera)
-    assert np.abs(away[:3]).max() < 0.05 and np.abs(away[3:]).max() < 2.0

@@ -1,6 +1,7 @@
 """Smooth errors of outlines as nuisance parameters.
 
-Errors of hand-drawn outlines change little over a few millimetres, so neighbouring samples have nearly the same error.
+Errors of drawn outlines and of colour edges change little over a few millimetres, so neighbouring samples have nearly
+the same error.
 Least squares treats samples as independent, and gives such errors too much weight where the contour is long. Here, the
 error is a smooth field over the image plus white noise: the field is interpolated bilinearly between nodes on a grid.
 Their values have a normal prior, and are eliminated from the normal equations (generalised least squares; Aitken 1936).

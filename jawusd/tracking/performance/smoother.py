@@ -27,9 +27,9 @@ _FOCAL_ROUNDS = 6  # the same if focal lengths are unknown, since they are coupl
 # Maximum number of solutions of the linearised equations, each with the bound linearised at the previous one; change of
 # d below which no further one is computed [mm].
 _BOUND_ROUNDS, _SAME_MM = 5, 0.05
-#: Ratio of true to computed variance of a frame's unknowns [-]: the equations ignore that outline errors persist over
-#: frames. With a model of smooth outline errors, fewer errors remain.
-WIDER, _WIDER_IF_SMOOTH = 1.5**2, 1.25**2
+#: Ratios of true to computed variance of a frame's unknowns [-], without and with a model of smooth outline errors: the
+#: equations ignore that errors persist over frames, and the model removes a part of these.
+VARIANCE_RATIO, _VARIANCE_RATIO_SMOOTH = 1.5**2, 1.25**2
 # Standard deviations of the prior for aligning frames again in which an arch was missed [rad, mm, mm].
 _NEARBY = np.r_[[0.05] * 3, [3.0] * 3, [3.0] * 3]
 
@@ -73,8 +73,8 @@ class Smoother:
             annotator: prior on annotator bias; default: of hand-drawn masks.
             skin: jaw parameters estimated from facial skin in every frame.
         """
-        self._wider = WIDER if instants.config.smooth_errors is None else _WIDER_IF_SMOOTH
-        self._skin = None if skin is None else SkinFactor(skin, fps, self._wider)
+        self._variance_ratio = VARIANCE_RATIO if instants.config.smooth_errors is None else _VARIANCE_RATIO_SMOOTH
+        self._skin = None if skin is None else SkinFactor(skin, fps, self._variance_ratio)
         self._cameras, self._rounds, self._shared_px3 = cameras, _FOCAL_ROUNDS if free_focal else _ROUNDS, shared_px3
         if views is None:
             self._rounds = 0
@@ -125,7 +125,7 @@ class Smoother:
         # The bound of the rig is omitted: it is an inequality, and would make the covariance too small.
         covariance, shared = self._covariance(self._system(fits, state, weight, motion, slow, None))
         if self._unknowns.free_focal:
-            sigma = np.sqrt(self._wider * np.diag(shared)[self._unknowns.focal])
+            sigma = np.sqrt(self._variance_ratio * np.diag(shared)[self._unknowns.focal])
         gains = np.stack([self._rig_gain(fit, weight) for fit in fits])
         by_skin = np.zeros(len(fits), bool) if self._skin is None else self._skin.used
         return Smoothed(fits, covariance, state, sigma, by_skin, gains)
@@ -232,14 +232,14 @@ class Smoother:
         wide = np.sqrt(unknowns.redundancy)
         shared = found.shared * np.outer(wide, wide)
         if not unknowns.fixed_head:
-            own = self._wider * found.own + found.response @ shared @ np.swapaxes(found.response, 1, 2)
+            own = self._variance_ratio * found.own + found.response @ shared @ np.swapaxes(found.response, 1, 2)
             return np.asarray(own, np.float64), found.shared
         # The head pose, which is constant over the take, is one of the take's unknowns.
         response = np.zeros((system.frames, LOCAL, unknowns.shared))
         response[:, HEAD, :6] = np.eye(6)
         response[:, JAW] = found.response
-        out = response @ (self._wider * shared) @ np.swapaxes(response, 1, 2)
-        out[:, JAW, JAW] += self._wider * found.own
+        out = response @ (self._variance_ratio * shared) @ np.swapaxes(response, 1, 2)
+        out[:, JAW, JAW] += self._variance_ratio * found.own
         return np.asarray(out, np.float64), found.shared
 
 

@@ -11,7 +11,6 @@ import numpy as np
 from jawusd.base.arrays import Array
 from jawusd.evaluator import JawRig
 from jawusd.geometry import Camera
-from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.contour.quality import residual_px
 from jawusd.tracking.contour.scan import Scan, thinned
 from jawusd.tracking.contour.solver import ContourSolver
@@ -19,22 +18,14 @@ from jawusd.tracking.performance.attempts import FrameFit
 from jawusd.tracking.performance.coordinates import JAW, Coordinates, Pose
 from jawusd.tracking.performance.instant import InstantSolver, rig_gain
 from jawusd.tracking.performance.motion import STEADY
-from jawusd.tracking.performance.smoother import WIDER
+from jawusd.tracking.performance.smoother import VARIANCE_RATIO
 from jawusd.tracking.region.appearance import CORRELATION_PX, Cut, LearnedColours
 from jawusd.tracking.region.effort import FAST
-from jawusd.tracking.region.rig_tracker import RigTracker
+from jawusd.tracking.region.rig_tracker import FOR_RIGS, RigTracker
 
 _FACES = 3_000
 # The settings are coarser than for recorded images, since dropped frames reduce accuracy more than coarse settings.
-_SETTINGS = replace(
-    TrackingConfig(),
-    sample_step_px=3.0,
-    redraw_px=4.0,
-    parallax_px=6.0,
-    settled_mm=0.4,
-    judged_mm=0.3,
-    smooth_errors=None,
-)
+_SETTINGS = replace(FOR_RIGS, sample_step_px=3.0, redraw_px=4.0, parallax_px=6.0, settled_mm=0.4, judged_mm=0.3)
 
 
 class LiveTake:
@@ -95,7 +86,7 @@ class LiveTake:
         """
         if self._tracker is None:
             raise ValueError("`carry` was called before `begin`")
-        self._tracker.carry(d, np.diag(covariance) / WIDER)
+        self._tracker.carry(d, np.diag(covariance) / VARIANCE_RATIO)
 
     def covariance_d(self, fit: FrameFit) -> Array:
         """Return the covariance of the jaw parameters d in the last step [mm^2], including the rig error (3, 3).
@@ -112,4 +103,4 @@ class LiveTake:
             precision = precision + outlines.matrix
             gain = rig_gain(self.coordinates, fit.pose, precision, outlines.misfit.precision)
             of_rig = gain @ self.coordinates.jaw.pose_covariance(fit.pose.d) @ gain.T
-        return np.asarray(WIDER * np.linalg.inv(precision)[JAW, JAW] + of_rig, np.float64)
+        return np.asarray(VARIANCE_RATIO * np.linalg.inv(precision)[JAW, JAW] + of_rig, np.float64)

@@ -12,7 +12,6 @@ from jawusd.evaluator import JawRig
 from jawusd.evaluator.skin import SkinJaw
 from jawusd.formats.performance import Performance
 from jawusd.geometry import Camera, transform_points
-from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.contour.annotator import AnnotatorPrior
 from jawusd.tracking.contour.quality import score_px
 from jawusd.tracking.contour.scan import Scan, teeth_centre, thinned
@@ -26,7 +25,7 @@ from jawusd.tracking.performance.results import performance_of
 from jawusd.tracking.performance.skin import SkinOf, jaw_of_skin
 from jawusd.tracking.performance.smoother import Smoothed, Smoother, with_one_head
 from jawusd.tracking.region.appearance import Cut, LearnedColours
-from jawusd.tracking.region.rig_tracker import RigTracker
+from jawusd.tracking.region.rig_tracker import FOR_RIGS, RigTracker
 from jawusd.tracking.region.search import FACES, REDRAW_PX, SAMPLE_STEP_PX
 
 #: Function that returns the cropped images of a range of frames. Arguments: cameras, possibly with changed focal
@@ -80,7 +79,6 @@ class PictureTake:
         scans: Sequence[Scan],
         axes: Array,
         shot: PictureShot,
-        config: TrackingConfig | None = None,
     ) -> None:
         """Prepare the scans.
 
@@ -89,18 +87,11 @@ class PictureTake:
             scans: upper and lower teeth, prepared.
             axes: rotation from scan to anatomical axes: left, up, front; shape (3, 3).
             shot: images and frames.
-            config: settings of the tracker.
         """
         self._axes, self._jaw, self._shot = axes, jaw, shot
         self._scans = [thinned(scan, _LAST_FACES) for scan in scans]
         self.coordinates = Coordinates(jaw, self._scans)
-        config = replace(
-            config or TrackingConfig(),
-            sample_step_px=SAMPLE_STEP_PX,
-            redraw_px=REDRAW_PX,
-            settled_mm=_SETTLED_MM,
-            smooth_errors=None,
-        )
+        config = replace(FOR_RIGS, sample_step_px=SAMPLE_STEP_PX, redraw_px=REDRAW_PX, settled_mm=_SETTLED_MM)
         self._instants, self._rough = (
             InstantSolver(ContourSolver([thinned(scan, faces) for scan in scans], config), self.coordinates)
             for faces in (_LAST_FACES, FACES)

@@ -11,6 +11,7 @@ import numpy as np
 
 from jawusd.base.arrays import Array
 from jawusd.geometry import transform_point, transform_points
+from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.contour.equations import translation
 from jawusd.tracking.contour.quality import matched_px, score_px
 from jawusd.tracking.initialization.first_frame import FIRST_ROUNDS
@@ -37,6 +38,9 @@ _LOST = 0.33  # fraction of the usual matched contour length below which an arch
 # number of frames since the last step above which an arch must fit as well as after a loss
 _UNSURE_FRAMES = 3.0
 _JAWS = 96  # number of jaw poses that a search ranks by colour
+#: Settings of solvers that follow a rig in images: the variances of their edges were chosen without a model of smooth
+#: errors.
+FOR_RIGS = replace(TrackingConfig(), smooth_errors=None)
 # With one camera, a jaw that is too far in front may fit a first frame as well as the true one. The frame is therefore
 # also aligned from the middle, without laterotrusion and protrusion, with standard deviations of the jaw that are
 # smaller by the first factor, and that pose is kept unless the other one fits better by the second factor. In 86 views

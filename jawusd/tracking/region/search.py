@@ -138,12 +138,11 @@ class PoseSearch:
         scans: Sequence[Scan],
         landmarks: Array,
         axes: Array,
-        config: TrackingConfig | None,
         executor: Executor | None,
     ) -> None:
         """Prepare the scans; for the arguments, see `RegionTracker`."""
         self.config = replace(
-            config or TrackingConfig(),
+            TrackingConfig(),
             sample_step_px=SAMPLE_STEP_PX,
             redraw_px=REDRAW_PX,
             parallax_px=_PARALLAX_PX,

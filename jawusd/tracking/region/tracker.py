@@ -12,7 +12,6 @@ import numpy as np
 
 from jawusd.base.arrays import Array, Mask
 from jawusd.geometry import Camera, relative_pose
-from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.contour.equations import Solution
 from jawusd.tracking.contour.quality import (
     matched_px,
@@ -92,7 +91,6 @@ class RegionTracker:
         cameras: Sequence[Camera],
         landmarks: Array,
         axes: Array,
-        config: TrackingConfig | None = None,
         executor: Executor | None = None,
     ) -> None:
         """Prepare the scans.
@@ -102,7 +100,7 @@ class RegionTracker:
             cameras: cameras in the order of the images.
             landmarks, axes: as in `CondyleMotion`.
         """
-        self._search = PoseSearch(scans, landmarks, axes, config, executor)
+        self._search = PoseSearch(scans, landmarks, axes, executor)
         self._colours = self._latest = LearnedColours(scans, cameras, axes)
         self._first_share, self.first_fit = np.zeros(2), 0.0
 

@@ -58,33 +58,30 @@ def rest_frames(
     if named is None:
         closed = {f: float((T[:3, :3] @ point + T[:3, 3] - point) @ up) for f, T in relative.items()}
         ranked = sorted(closed, key=lambda f: -closed[f])
-        named = next((f for f in ranked if _stillness(relative, f, f + 1, probes)), None)
+        named = next((f for f in ranked if _likeness(relative, f, f + 1, probes, _STILL_MM)), None)
     if named is None or named not in relative:
         return {}
     weights = {named: 1.0}
     for step in (1, -1):
-        frame, weight = named, 1.0
-        while abs(frame + step - named) <= _LONGEST_REST:
-            weight = min(weight, _stillness(relative, frame, frame + step, probes))
-            frame += step
-            if weight:
-                weight = min(weight, _bisquare(_moved_mm(relative[frame], relative[named], probes) / _SAME_BITE_MM))
-            if not weight:
+        weight = 1.0
+        for frame in range(named + step, named + step * (_LONGEST_REST + 1), step):
+            still = _likeness(relative, frame, frame - step, probes, _STILL_MM)
+            weight = min(weight, still, _likeness(relative, frame, named, probes, _SAME_BITE_MM))
+            if weight == 0:
                 break
             weights[frame] = weight
     return dict(sorted(weights.items()))
 
 
-def _stillness(relative: Mapping[int, Array], frame: int, other: int, probes: Array) -> float:
-    """Return the weight of a frame for the motion of the lower arch from one beside it; 0 if one is not tracked."""
+def _likeness(relative: Mapping[int, Array], frame: int, other: int, probes: Array, limit_mm: float) -> float:
+    """Return a weight for the distance of the lower arch between two frames: 0 at the limit, or if one is not tracked.
+
+    The weight is the bisquare of Beaton & Tukey (1974).
+    """
     if frame not in relative or other not in relative:
         return 0.0
-    return _bisquare(_moved_mm(relative[frame], relative[other], probes) / _STILL_MM)
-
-
-def _bisquare(ratio: float) -> float:
-    """Return the weight of a deviation, given as a fraction of the limit at which it is 0 (Beaton & Tukey 1974)."""
-    return float((1.0 - min(ratio, 1.0) ** 2) ** 2)
+    ratio = min(_moved_mm(relative[frame], relative[other], probes) / limit_mm, 1.0)
+    return (1.0 - ratio**2) ** 2
 
 
 def _moved_mm(one: Array, other: Array, probes: Array) -> float:
