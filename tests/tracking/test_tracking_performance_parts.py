@@ -25,7 +25,7 @@ from jawusd.geometry import (
 from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.contour.annotator import DRAWN, AnnotatorPrior
 from jawusd.tracking.contour.equations import OutlineSums
-from jawusd.tracking.performance.attempts import Attempts, Trial
+from jawusd.tracking.performance.attempts import Attempts, Trial, Usual
 from jawusd.tracking.performance.coordinates import HEAD, JAW, LOCAL, OPENING, Coordinates, Pose
 from jawusd.tracking.performance.instant import CLOSED_MM, Misfit, bound_equations, rig_gain
 from jawusd.tracking.performance.motion import measured_motion
@@ -315,8 +315,11 @@ def test_the_table_is_read_as_parameters(performance, tmp_path):
     assert lines[5].endswith("inside,carried") and lines[-1].endswith("off the model; outside,solved")
 
 
-@pytest.mark.parametrize(("uncovered_px", "lost"), [(60.0, False), (400.0, True)])
-def test_an_arch_is_lost_if_the_penalty_for_uncovered_mask_exceeds_its_matched_contour(uncovered_px, lost):
+@pytest.mark.parametrize(
+    ("uncovered_px", "usual", "lost"),
+    [(100.0, 0.01, False), (160.0, 0.01, True), (160.0, 0.03, False), (400.0, 0.03, True)],
+)
+def test_an_arch_is_lost_if_more_mask_than_usual_is_uncovered_than_its_contour_is_worth(uncovered_px, usual, lost):
     """One camera; both uncovered fractions are below the limit, and residuals and matched contour are good enough."""
     outline = OutlineSums.zeros(1)._replace(
         score_px=np.array([[40.0], [320.0]]), matched_px=np.array([[60.0], [350.0]]), weight=np.ones((2, 1))
@@ -329,5 +332,6 @@ def test_an_arch_is_lost_if_the_penalty_for_uncovered_mask_exceeds_its_matched_c
         mask_px=np.full((2, 1), 4000.0),
     )
     assert TrackingConfig().lost_coverage > uncovered_px / 4000.0
-    attempts = Attempts(SimpleNamespace(config=TrackingConfig()), np.ones(2))
+    usually = Usual(np.ones(2), np.full(2, usual))
+    attempts = Attempts(SimpleNamespace(config=TrackingConfig()), np.ones(2), usually)
     assert attempts.bad(trial).tolist() == [lost, False]

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -23,6 +24,7 @@ from jawusd.tracking.performance.views import Growth
 LARGEST_SIGMA = np.r_[[0.3] * 3, [30.0] * 3, [10.0] * 3]
 _LEAST_MATCHED_PX = 15.0  # matched contour below which an arch is rejected [px]: 2 mm of tooth edge
 _TYPICAL_PX = 0.4  # typical residual of hand-drawn masks at the working resolution [px]
+_TYPICAL_UNCOVERED = 0.01  # fraction of a mask that good poses leave uncovered [-]
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,6 +65,14 @@ class Trial:
         """Return the matched contour minus the penalty for uncovered mask, per arch [px], shape (2,)."""
         return np.where(self.use, score_px(self.solution) - price * self.uncovered_px, 0.0).sum(1)
 
+    def worth_px(self, price: float, usual_uncovered: Array) -> Array:
+        """Return `fit_px` with the penalty only for more uncovered mask than usual, shape (2,).
+
+        `usual_uncovered` are the usual uncovered fractions of both arches, shape (2,). Little contour is visible while
+        the teeth are closed, so errors of its outline alone would outweigh it.
+        """
+        return self.fit_px(price) + price * usual_uncovered * np.where(self.use, self.mask_px, 0.0).sum(1)
+
     def objective(self, price: float) -> float:
         """Return the score that ranks attempts: the sum of `fit_px` over both arches [px]."""
         return float(self.fit_px(price).sum())
@@ -82,24 +92,31 @@ class Instant:
     present: Mask  # whether each mask is available, shape (2, C)
 
 
-class Attempts:
-    """Aligns single frames, and accepts or rejects results by comparison with the usual residual of the take."""
+class Usual(NamedTuple):
+    """What good alignments of a take leave, per arch."""
 
-    def __init__(self, instants: InstantSolver, outline_weight: Array, usual_px: Array | None = None) -> None:
-        """Prepare with the `outline_weight` of `InstantSolver.align`, and the usual residual per arch (2,) [px]."""
+    residual_px: Array  # residual [px], shape (2,)
+    uncovered: Array  # mean uncovered fraction of a mask [-], shape (2,)
+
+
+class Attempts:
+    """Aligns single frames, and accepts or rejects results by comparison with the usual ones of the take."""
+
+    def __init__(self, instants: InstantSolver, outline_weight: Array, usual: Usual | None = None) -> None:
+        """Prepare with the `outline_weight` of `InstantSolver.align`, and what is usual in the take."""
         self.instants, self.config, self._weight = instants, instants.config, outline_weight
-        self._residuals: deque[Array] = deque(maxlen=self.config.history_frames)
-        if usual_px is not None:
-            self._residuals.append(usual_px)
+        self._aligned: deque[Usual] = deque(maxlen=self.config.history_frames)
+        if usual is not None:
+            self._aligned.append(usual)
 
     def instant(self, views: Sequence[View]) -> Instant:
         """Prepare the data shared by all attempts on the frame with these views."""
         return Instant(views, self.instants.solver.rendering(views), present_masks(views))
 
     def remember(self, fit: FrameFit) -> None:
-        """Add a frame to the statistics of the usual residual."""
+        """Add a frame to the statistics of what is usual."""
         if fit.solution is not None and fit.found.all():
-            self._residuals.append(residual_px(fit.solution))
+            self._aligned.append(usual_of([fit]))
 
     def near(self, start: Pose, instant: Instant, sigma: Array = LARGEST_SIGMA) -> FrameFit:
         """Align a frame near a start pose with given standard deviations (9,); reject arches that do not fit."""
@@ -123,11 +140,20 @@ class Attempts:
     def bad(self, trial: Trial) -> Mask:
         """Return which arches do not fit their masks, shape (2,)."""
         c = self.config
-        usual = np.median(self._residuals, axis=0) if self._residuals else np.full(2, np.inf)
-        rough = ~(residual_px(trial.solution) <= c.lost_residual * c.suspect_residual * usual)
+        usual = self._usual
+        rough = ~(residual_px(trial.solution) <= c.lost_residual * c.suspect_residual * usual.residual_px)
         uncovered = np.where(trial.use, trial.uncovered, 0.0).max(1) > c.lost_coverage
         few = matched_px(trial.solution) < _LEAST_MATCHED_PX
-        return np.asarray(trial.use.any(1) & (rough | uncovered | few | (trial.fit_px(c.uncovered_price) <= 0.0)))
+        worthless = trial.worth_px(c.uncovered_price, usual.uncovered) <= 0.0
+        return np.asarray(trial.use.any(1) & (rough | uncovered | few | worthless))
+
+    @property
+    def _usual(self) -> Usual:
+        """Return the medians over recent alignments; before the first one, any residual is usual."""
+        if not self._aligned:
+            return Usual(np.full(2, np.inf), np.full(2, _TYPICAL_UNCOVERED))
+        residuals, uncovered = zip(*self._aligned, strict=True)
+        return Usual(np.median(residuals, axis=0), np.median(uncovered, axis=0))
 
     def without_wrong_masks(self, trial: Trial, expected: Expected, instant: Instant) -> Trial:
         """Leave out a single mask of each arch that does not fit, if the arch then fits its other masks.
@@ -154,7 +180,7 @@ class Attempts:
     def _spare(self, trial: Trial, arch: int) -> bool:
         """Return whether an arch has a mask to spare: one of two does if the other arch and the past are known."""
         own, other = trial.use[arch].sum(), trial.use[1 - arch].sum()
-        return bool(own > FEWEST_MASKS or (own == FEWEST_MASKS <= other and self._residuals))
+        return bool(own > FEWEST_MASKS or (own == FEWEST_MASKS <= other and self._aligned))
 
     def judged(self, trial: Trial, instant: Instant) -> FrameFit:
         """Return the attempt as a frame fit, excluding arches that do not fit their masks."""
@@ -169,8 +195,17 @@ def empty_fit(pose: Pose, instant: Instant) -> FrameFit:
     return FrameFit(pose, None, none, instant.present, np.full(none.shape, np.nan))
 
 
-def usual_residual_px(fits: Iterable[FrameFit]) -> Array:
-    """Return the median residual of each arch over the fits in which it was found [px], shape (2,)."""
-    listed = [(residual_px(fit.solution), fit.found) for fit in fits if fit.solution is not None]
-    values = [[residual[r] for residual, found in listed if found[r]] for r in ARCHES]
-    return np.array([np.median(own) if own else _TYPICAL_PX for own in values])
+def usual_of(fits: Iterable[FrameFit]) -> Usual:
+    """Return the medians over the fits in which an arch was found; typical values if there is none."""
+    listed = [(residual_px(fit.solution), _mean_uncovered(fit), fit.found) for fit in fits if fit.solution is not None]
+
+    def median(column: int, typical: float) -> Array:
+        values = [[row[column][r] for row in listed if row[2][r]] for r in ARCHES]
+        return np.array([np.median(own) if own else typical for own in values])
+
+    return Usual(median(0, _TYPICAL_PX), median(1, _TYPICAL_UNCOVERED))
+
+
+def _mean_uncovered(fit: FrameFit) -> Array:
+    """Return the mean uncovered fraction of the used masks of each arch [-], shape (2,); 0 without any."""
+    return np.asarray(np.where(fit.use, fit.uncovered, 0.0).sum(1) / np.maximum(fit.use.sum(1), 1))

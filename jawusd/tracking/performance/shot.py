@@ -26,7 +26,7 @@ from jawusd.tracking.initialization.first_frame import LEAST_FIT
 from jawusd.tracking.initialization.footage import Footage
 from jawusd.tracking.initialization.scan_checks import check_occlusion
 from jawusd.tracking.initialization.start import find_start
-from jawusd.tracking.performance.attempts import Attempts, FrameFit, usual_residual_px
+from jawusd.tracking.performance.attempts import Attempts, FrameFit, usual_of
 from jawusd.tracking.performance.coordinates import HEAD, Coordinates, Pose
 from jawusd.tracking.performance.forward import ForwardPass
 from jawusd.tracking.performance.instant import InstantSolver, quick, whole
@@ -127,8 +127,8 @@ class _Take:
         If frames are aligned again, their residuals are compared with those of all frames aligned so far.
         """
         again = any(frame in self.fits for frame in way)
-        usual_px = usual_residual_px(self.fits.values()) if again else None
-        passing = ForwardPass(Attempts(self._quick, self._weight, usual_px), near, fixed_head=self._shot.fixed_head)
+        usual = usual_of(self.fits.values()) if again else None
+        passing = ForwardPass(Attempts(self._quick, self._weight, usual), near, fixed_head=self._shot.fixed_head)
         for frame in way:
             yield passing.step(self._views.at(frame))
 

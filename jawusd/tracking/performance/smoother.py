@@ -13,7 +13,7 @@ from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.contour.annotator import AnnotatorPrior, drawn_prior
 from jawusd.tracking.contour.quality import outline_errors
 from jawusd.tracking.contour.solver import Matched
-from jawusd.tracking.performance.attempts import LARGEST_SIGMA, Attempts, FrameFit, usual_residual_px
+from jawusd.tracking.performance.attempts import LARGEST_SIGMA, Attempts, FrameFit, usual_of
 from jawusd.tracking.performance.coordinates import HEAD, JAW, LOCAL, Coordinates, Pose
 from jawusd.tracking.performance.instant import InstantSolver, rig_gain
 from jawusd.tracking.performance.motion import Motion, head_bends, measured_motion
@@ -216,7 +216,7 @@ class Smoother:
         """Repeat the alignment of arches that have masks but were not found, starting from smoothed poses."""
         if self._views is None:
             return fits
-        attempts = Attempts(self._instants, weight, usual_residual_px(fits))
+        attempts = Attempts(self._instants, weight, usual_of(fits))
         for k, fit in enumerate(fits):
             if fit.missed.any():
                 again = attempts.near(fit.pose, attempts.instant(self._views.at(self._frames[k])), _NEARBY)
