@@ -125,6 +125,18 @@ def test_one_mask_does_not_outvote_two(tracker):
     assert max(_errors(record)) < 0.15
 
 
+@pytest.mark.parametrize(("uncovered_px", "wrong"), [(250.0, False), (350.0, True)])
+def test_a_mask_is_wrong_if_its_contour_is_worth_less_than_what_is_uncovered(tracker, uncovered_px, wrong):
+    """The uncovered fraction and the matched contour are both within their own limits."""
+    trial = tracker._try(POSES[1], _views(1), CONFIG.gates_from(0.0), np.ones((2, 3), bool))
+    score_px, uncovered = trial.solution.outline.score_px.copy(), trial.uncovered.copy()
+    score_px[0, 2], uncovered[0, 2] = 150.0, uncovered_px
+    solution = replace(trial.solution, outline=trial.solution.outline._replace(score_px=score_px))
+    spoiled = tracker._spoiled(replace(trial, solution=solution, uncovered=uncovered), 1)
+    assert uncovered_px / trial.mask_px[0, 2] < CONFIG.suspect_coverage
+    assert spoiled.tolist() == [[False, False, wrong], [False] * 3]
+
+
 @pytest.mark.parametrize(
     ("reason", "limits", "words"),
     [

@@ -156,11 +156,17 @@ class FrameTracker:
         """Return the masks that a scan does not fit although it fits at least `fewest` other masks, shape (2, C)."""
         dead = trial.use & (score_px(trial.solution) < self._config.dead_score * self.history.usual_score())
         uncovered = trial.use & (trial.coverage > self._config.lost_coverage)  # same limit as for a lost arch
-        wrong = self._badly_covered(trial) | uncovered | dead
+        wrong = self._badly_covered(trial) | uncovered | dead | self._worthless(trial)
         for r in ARCHES:
             if (trial.use[r] & ~wrong[r]).sum() < fewest:
                 wrong[r] = False  # a wrong pose is more likely than so many wrong masks
         return wrong
+
+    def _worthless(self, trial: _Trial) -> Mask:
+        """Return the masks whose matched contour is worth less than what is unusually uncovered, shape (2, C)."""
+        usual_px = self.history.usual_coverage() * trial.mask_px
+        worth = score_px(trial.solution) - self._config.uncovered_price * (trial.uncovered - usual_px)
+        return np.asarray(trial.use & (worth <= 0.0))
 
     def _losses(self, trial: _Trial) -> tuple[Loss, Loss]:
         """Return, for each arch, the first check that it fails."""
