@@ -66,6 +66,15 @@ def uncovered_px(
     return uncovered, total
 
 
+def worth_px(solution: Solution, uncovered_px: Array, usual_px: Array, price: float) -> Array:
+    """Return the matched contour less the penalty for more uncovered mask than usual, per arch and view [px], (2, C).
+
+    Where lips leave little of the contour visible, the usual errors of an outline would outweigh it. `price` is as
+    `uncovered_price` in `arch_fit`.
+    """
+    return score_px(solution) - price * (uncovered_px - usual_px)
+
+
 def coverage_error(uncovered: Array, total: Array) -> Array:
     """Return the uncovered fraction of every mask from the results of `uncovered_px`; NaN without a mask."""
     return np.where(total > 0, uncovered / np.maximum(total, 1), np.nan)

@@ -11,7 +11,7 @@ import numpy as np
 
 from jawusd.base.arrays import Array, Mask
 from jawusd.tracking.contour.equations import Solution
-from jawusd.tracking.contour.quality import coverage_error, matched_px, residual_px, score_px
+from jawusd.tracking.contour.quality import coverage_error, matched_px, residual_px, score_px, worth_px
 from jawusd.tracking.contour.rendering import Rendering
 from jawusd.tracking.contour.scan import ARCHES, CROWN
 from jawusd.tracking.contour.views import FEWEST_MASKS, View, present_masks
@@ -61,21 +61,9 @@ class Trial:
     uncovered_px: Array
     mask_px: Array
 
-    def fit_px(self, price: float) -> Array:
-        """Return the matched contour minus the penalty for uncovered mask, per arch [px], shape (2,)."""
-        return np.where(self.use, score_px(self.solution) - price * self.uncovered_px, 0.0).sum(1)
-
-    def worth_px(self, price: float, usual_uncovered: Array) -> Array:
-        """Return `fit_px` with the penalty only for more uncovered mask than usual, shape (2,).
-
-        `usual_uncovered` are the usual uncovered fractions of both arches, shape (2,). Little contour is visible while
-        the teeth are closed, so errors of its outline alone would outweigh it.
-        """
-        return self.fit_px(price) + price * usual_uncovered * np.where(self.use, self.mask_px, 0.0).sum(1)
-
     def objective(self, price: float) -> float:
-        """Return the score that ranks attempts: the sum of `fit_px` over both arches [px]."""
-        return float(self.fit_px(price).sum())
+        """Return the score that ranks attempts: the matched contour minus the penalty for uncovered mask [px]."""
+        return float(np.where(self.use, score_px(self.solution) - price * self.uncovered_px, 0.0).sum())
 
     @property
     def uncovered(self) -> Array:
@@ -144,7 +132,9 @@ class Attempts:
         rough = ~(residual_px(trial.solution) <= c.lost_residual * c.suspect_residual * usual.residual_px)
         uncovered = np.where(trial.use, trial.uncovered, 0.0).max(1) > c.lost_coverage
         few = matched_px(trial.solution) < _LEAST_MATCHED_PX
-        worthless = trial.worth_px(c.uncovered_price, usual.uncovered) <= 0.0
+        usual_px = usual.uncovered[:, None] * trial.mask_px
+        worth = worth_px(trial.solution, trial.uncovered_px, usual_px, c.uncovered_price)
+        worthless = np.where(trial.use, worth, 0.0).sum(1) <= 0.0
         return np.asarray(trial.use.any(1) & (rough | uncovered | few | worthless))
 
     @property

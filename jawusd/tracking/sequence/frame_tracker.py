@@ -22,6 +22,7 @@ from jawusd.tracking.contour.quality import (
     score_px,
     uncovered_px,
     view_residual_px,
+    worth_px,
 )
 from jawusd.tracking.contour.scan import ARCHES
 from jawusd.tracking.contour.solver import ContourSolver
@@ -165,7 +166,7 @@ class FrameTracker:
     def _worthless(self, trial: _Trial) -> Mask:
         """Return the masks whose matched contour is worth less than what is unusually uncovered, shape (2, C)."""
         usual_px = self.history.usual_coverage() * trial.mask_px
-        worth = score_px(trial.solution) - self._config.uncovered_price * (trial.uncovered - usual_px)
+        worth = worth_px(trial.solution, trial.uncovered, usual_px, self._config.uncovered_price)
         return np.asarray(trial.use & (worth <= 0.0))
 
     def _losses(self, trial: _Trial) -> tuple[Loss, Loss]:
