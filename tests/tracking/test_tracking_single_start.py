@@ -12,6 +12,7 @@ from bumpy_teeth import make_cameras
 from rig_take import COUNT, write_masks
 
 from jawusd.evaluator import JawRig
+from jawusd.geometry import transform_point
 from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.contour.solver import ContourSolver
 from jawusd.tracking.contour.views import masked_sources
@@ -21,8 +22,8 @@ from jawusd.tracking.performance.coordinates import Coordinates, Pose
 from jawusd.tracking.performance.single_start import SingleStart
 
 
-def begun(jaw, scans, truth, folder, camera):
-    """Search for the start with one camera; return the step from the true pose of the frame found."""
+def prepared(jaw, scans, truth, folder, camera):
+    """Return the search with one camera, and the masks it searches."""
     source = small_take.source(folder, camera.name)
     capture = small_take.make_capture(folder, COUNT, cameras=[source], bootstrap=None)
     with_d = JawRig({**jaw.arrays, "codes": np.vstack([truth[0], [[2.0, 0, 0], [14.0, 1, 1]]])}, jaw.meta)
@@ -30,10 +31,38 @@ def begun(jaw, scans, truth, folder, camera):
     footage = Footage(
         masked_sources(capture.cameras, table, small_take.OFFSETS, 1), table, small_take.OFFSETS, capture.frames, 1
     )
-    search = SingleStart(small_take.MESHES, ContourSolver(scans, TrackingConfig()), with_d, np.eye(4))
+    return SingleStart(small_take.MESHES, ContourSolver(scans, TrackingConfig()), with_d, np.eye(4)), footage
+
+
+def begun(jaw, scans, truth, folder, camera):
+    """Search for the start with one camera; return the step from the true pose of the frame found."""
+    search, footage = prepared(jaw, scans, truth, folder, camera)
     found = search.find(footage)
     k = found.frame - small_take.FIRST
     return Coordinates(jaw, scans).step(Pose(truth[1][k], truth[0][k]), found.pose)
+
+
+@pytest.mark.parametrize(("arch", "off"), [(0, [-15.0, 0, 0]), (1, [18.0, 8, 0])])
+def test_a_start_in_which_only_one_arch_is_in_place_is_aligned_from_other_jaws(jaw, scans, truth, folder, arch, off):
+    camera, coordinates, k = small_take.CAMERAS[0], Coordinates(jaw, scans), int(truth[0][:, 0].argmax())
+    search, footage = prepared(jaw, scans, truth, folder, camera)
+    true = Pose(truth[1][k], truth[0][k])
+    start = coordinates.with_jaw(true, true.d + off, arch)
+    frame, px_per_mm = small_take.FIRST + k, TrackingConfig().working_px_per_mm
+    with footage.views(transform_point(true.head, scans[0].centre), px_per_mm) as masks:
+        views = masks.at(frame)
+    assert not search._fine.near(start, search._fine.instant(views)).found.all()
+    away = coordinates.step(true, search._refined(start, views, frame).pose)
+    assert np.abs(away[:3]).max() < 0.03 and np.abs(away[3:]).max() < 1.5
+
+
+@pytest.mark.parametrize("arch", [0, 1])
+def test_other_jaw_parameters_leave_an_arch_in_place(jaw, scans, truth, arch):
+    coordinates = Coordinates(jaw, scans)
+    pose = Pose(truth[1][0], truth[0][0], np.array([0.01, 0, 0, 0.2, 0, 0]))
+    moved = coordinates.with_jaw(pose, pose.d + [6.0, 1, 0], arch)
+    np.testing.assert_allclose(coordinates.arches(moved)[arch], coordinates.arches(pose)[arch], atol=1e-9)
+    assert moved.d == pytest.approx(pose.d + [6.0, 1, 0])
 
 
 @pytest.mark.slow

@@ -125,6 +125,20 @@ class Attempts:
             uncovered[r, c] = (mask & (rendering.labels[c][r] != CROWN)).sum()
         return Trial(aligned.pose, aligned.solution, use, uncovered, total)
 
+    def best_starts(self, starts: Sequence[Pose], precision: Array, instant: Instant, count: int) -> list[Pose]:
+        """Return the start poses that fit best after a few steps, the best one first.
+
+        `precision` (9,) is that of `Expected`, about each start.
+        """
+        config = self.config
+
+        def score(start: Pose) -> float:
+            expected = Expected(start, precision)
+            trial = self.attempt(start, expected, instant, instant.present, config.trial_gates_px)
+            return trial.objective(config.uncovered_price)
+
+        return sorted(starts, key=score, reverse=True)[:count]
+
     def bad(self, trial: Trial) -> Mask:
         """Return which arches do not fit their masks, shape (2,)."""
         c = self.config

@@ -68,6 +68,12 @@ class Coordinates:
         """Return the rig pose nearest to the given poses of the two arches, shape (2, 4, 4)."""
         return Pose(arches[0].copy(), self.jaw.encode(se3_inverse(arches[0]) @ arches[1])[0])
 
+    def with_jaw(self, pose: Pose, d: Array, arch: int) -> Pose:
+        """Return a pose with other jaw parameters (3,) in which one arch, 0 or 1, stays in place."""
+        moved = replace(pose, d=d)
+        back = self.arches(pose)[arch] @ se3_inverse(self.arches(moved)[arch])
+        return replace(moved, head=orthonormalise(back @ pose.head))
+
     def slopes(self, pose: Pose) -> tuple[Array, Array]:
         """Return the derivatives of both arches' left world twists with respect to the unknowns, shape (6, 9) each.
 

@@ -70,15 +70,15 @@ class ForwardPass:
     def _other_starts(self, trial: Trial, expected: Expected, instant: Instant) -> list[Pose]:
         """Return further starts: the prediction, the last pose, and the best of jaw poses over the whole range.
 
-        The head is that of the trial if the upper teeth fit, else the expected one, moved onto the masks.
+        An arch of the trial that fits stays in place; else the expected head is moved onto the masks.
         """
         jaws = [expected.pose.d, *self._jaws]
-        if trial.use[0].any() and not self._attempts.bad(trial)[0]:
-            poses = [replace(trial.pose, d=d) for d in jaws]
+        fitting = np.flatnonzero(trial.use.any(1) & ~self._attempts.bad(trial))
+        if len(fitting):
+            poses = [self._coordinates.with_jaw(trial.pose, d, int(fitting[0])) for d in jaws]
         else:
             poses = [self._onto_masks(replace(expected.pose, d=d), instant) for d in jaws]
-        scores = [self._score(pose, expected, instant) for pose in poses]
-        best = [poses[k] for k in np.argsort(scores)[::-1][:_FINALISTS]]
+        best = self._attempts.best_starts(poses, expected.precision, instant, _FINALISTS)
         return [expected.pose, self._motion.last, *best]
 
     def _onto_masks(self, pose: Pose, instant: Instant) -> Pose:
@@ -87,9 +87,3 @@ class ForwardPass:
         scan, at = self._attempts.instants.solver.scans[arch], self._coordinates.arches(pose)[arch]
         shift = shift_to_masks(scan, at, arch, instant.views, instant.present)
         return replace(pose, head=translation(shift) @ pose.head)
-
-    def _score(self, start: Pose, expected: Expected, instant: Instant) -> float:
-        """Return the objective of a start pose after a few alignment steps [px]."""
-        config, around = self._attempts.config, replace(expected, pose=start)
-        trial = self._attempts.attempt(start, around, instant, instant.present, config.trial_gates_px)
-        return trial.objective(config.uncovered_price)

@@ -50,11 +50,12 @@ _SURVEYED, _FRAMES_TRIED, _MOST_TRIED = 24, 4, 10
 _WIDTHS_MM = 22.0 * 1.1 ** np.arange(14)
 _USUAL_WIDTH_MM = 42.0
 # A side camera sees more of one side of the arch, so the centre of its mask lies up to 16 mm beside the front teeth (18
-# cameras of 6 synthetic persons).
+# cameras of 6 synthetic persons). There, lips that hide most of the upper teeth turn the line between both masks by up
+# to 37 degrees (12 head-mounted cameras of 12 synthetic persons).
 _GRID = Grid(
     yaw_rad=np.radians(np.arange(-60, 61, 10.0)),
     pitch_rad=np.radians(np.arange(-32, 33, 8.0)),
-    roll_rad=np.radians(np.arange(-32, 33, 8.0)),
+    roll_rad=np.radians(np.arange(-40, 41, 8.0)),
     reach_mm=(18.0, 7.5, 0.1),
 )
 _SHIFTS = np.stack(np.meshgrid(*[np.arange(-3, 3.1, 1.5)] * 2, [0.0], indexing="ij"), axis=-1).reshape(-1, 3)
@@ -64,6 +65,7 @@ _SHIFTS = np.stack(np.meshgrid(*[np.arange(-3, 3.1, 1.5)] * 2, [0.0], indexing="
 _HEADS, _JAWS, _TRIED, _FINALISTS, _WINNERS = 17, 32, 12, 24, 5
 # Penalty per crown pixel outside the mask, in px of contour [1/px]: low, since lips may hide crowns.
 _OUTSIDE_PRICE = 0.05
+_JAWS_REFINED = 3  # number of jaw poses aligned fully if only one arch was found
 _DISTINCT_MM = 3.0  # minimum distance between head poses that are kept [mm], as mean displacement of the teeth
 _LEAST_FIT = 0.1  # fit of the worse arch below which a start is rejected [-]; it is accepted at once from CLEAR_FIT on
 _NEARBY = LARGEST_SIGMA / 3.0  # standard deviations of the true pose about a candidate pose [rad, mm, mm]
@@ -190,7 +192,13 @@ class SingleStart:
 
     def _refined(self, pose: Pose, views: Sequence[View], frame: int) -> FoundPose | None:
         """Align a pose at working resolution; return None if an arch is not found."""
-        found = self._fine.near(pose, self._fine.instant(views))
+        instant = self._fine.instant(views)
+        found = self._fine.near(pose, instant)
+        if found.found.sum() == 1:  # it may be in place already with the other one far off
+            arch = int(found.found.argmax())
+            starts = [self._fine.instants.coordinates.with_jaw(found.pose, d, arch) for d in self._jaws]
+            best = self._fine.best_starts(starts, _NEARBY**-2.0, instant, _JAWS_REFINED)
+            found = max((self._fine.near(start, instant) for start in best), key=lambda fit: fit.objective_px)
         if found.solution is None or not found.found.all():
             return None
         fit = arch_fit(self._fine.instants.solver.scans, found.solution, views, self._config.uncovered_price)
