@@ -315,23 +315,31 @@ def test_the_table_is_read_as_parameters(performance, tmp_path):
     assert lines[5].endswith("inside,carried") and lines[-1].endswith("off the model; outside,solved")
 
 
+def bad_arches(score_px, uncovered_px, usual):
+    """Return which arches of a trial do not fit; only contour and uncovered pixels of the masks, (2, C), matter."""
+    score_px, uncovered_px = np.array(score_px), np.array(uncovered_px)
+    outline = OutlineSums.zeros(score_px.shape[1])._replace(
+        score_px=score_px, matched_px=1.5 * score_px, weight=np.ones(score_px.shape)
+    )
+    trial = Trial(
+        pose=Pose(np.eye(4), np.zeros(3)),
+        solution=SimpleNamespace(outline=outline),
+        use=np.ones(score_px.shape, bool),
+        uncovered_px=uncovered_px,
+        mask_px=np.full(score_px.shape, 4000.0),
+    )
+    assert (trial.uncovered < TrackingConfig().lost_coverage).all()
+    usually = Usual(np.ones(2), np.full(2, usual))
+    return Attempts(SimpleNamespace(config=TrackingConfig()), np.ones(2), usually).bad(trial).tolist()
+
+
 @pytest.mark.parametrize(
     ("uncovered_px", "usual", "lost"),
     [(100.0, 0.01, False), (160.0, 0.01, True), (160.0, 0.03, False), (400.0, 0.03, True)],
 )
 def test_an_arch_is_lost_if_more_mask_than_usual_is_uncovered_than_its_contour_is_worth(uncovered_px, usual, lost):
-    """One camera; both uncovered fractions are below the limit, and residuals and matched contour are good enough."""
-    outline = OutlineSums.zeros(1)._replace(
-        score_px=np.array([[40.0], [320.0]]), matched_px=np.array([[60.0], [350.0]]), weight=np.ones((2, 1))
-    )
-    trial = Trial(
-        pose=Pose(np.eye(4), np.zeros(3)),
-        solution=SimpleNamespace(outline=outline),
-        use=np.ones((2, 1), bool),
-        uncovered_px=np.array([[uncovered_px], [30.0]]),
-        mask_px=np.full((2, 1), 4000.0),
-    )
-    assert TrackingConfig().lost_coverage > uncovered_px / 4000.0
-    usually = Usual(np.ones(2), np.full(2, usual))
-    attempts = Attempts(SimpleNamespace(config=TrackingConfig()), np.ones(2), usually)
-    assert attempts.bad(trial).tolist() == [lost, False]
+    assert bad_arches([[40.0], [320.0]], [[uncovered_px], [30.0]], usual) == [lost, False]
+
+
+def test_a_good_mask_does_not_make_up_for_one_that_is_worth_less_than_it_leaves_uncovered():
+    assert bad_arches([[40.0, 320.0], [320.0, 320.0]], [[160.0, 30.0], [30.0, 30.0]], 0.01) == [True, False]

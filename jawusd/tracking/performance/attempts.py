@@ -148,7 +148,7 @@ class Attempts:
         few = matched_px(trial.solution) < _LEAST_MATCHED_PX
         usual_px = usual.uncovered[:, None] * trial.mask_px
         worth = worth_px(trial.solution, trial.uncovered_px, usual_px, c.uncovered_price)
-        worthless = np.where(trial.use, worth, 0.0).sum(1) <= 0.0
+        worthless = (trial.use & (worth <= 0.0)).any(1)
         return np.asarray(trial.use.any(1) & (rough | uncovered | few | worthless))
 
     @property
