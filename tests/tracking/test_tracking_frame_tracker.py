@@ -126,7 +126,7 @@ def test_one_mask_does_not_outvote_two(tracker):
 
 
 @pytest.mark.parametrize(("uncovered_px", "wrong"), [(250.0, False), (350.0, True)])
-def test_a_mask_is_wrong_if_its_contour_is_worth_less_than_what_is_uncovered(tracker, uncovered_px, wrong):
+def test_a_mask_is_wrong_if_its_penalty_exceeds_its_matched_contour(tracker, uncovered_px, wrong):
     """The uncovered fraction and the matched contour are both within their own limits."""
     trial = tracker._try(POSES[1], _views(1), CONFIG.gates_from(0.0), np.ones((2, 3), bool))
     score_px, uncovered = trial.solution.outline.score_px.copy(), trial.uncovered.copy()

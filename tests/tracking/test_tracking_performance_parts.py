@@ -337,9 +337,9 @@ def bad_arches(score_px, uncovered_px, usual):
     ("uncovered_px", "usual", "lost"),
     [(100.0, 0.01, False), (160.0, 0.01, True), (160.0, 0.03, False), (400.0, 0.03, True)],
 )
-def test_an_arch_is_lost_if_more_mask_than_usual_is_uncovered_than_its_contour_is_worth(uncovered_px, usual, lost):
+def test_an_arch_is_lost_if_the_penalty_of_a_mask_exceeds_its_matched_contour(uncovered_px, usual, lost):
     assert bad_arches([[40.0], [320.0]], [[uncovered_px], [30.0]], usual) == [lost, False]
 
 
-def test_a_good_mask_does_not_make_up_for_one_that_is_worth_less_than_it_leaves_uncovered():
+def test_the_penalty_of_one_mask_is_not_balanced_by_the_contour_of_another():
     assert bad_arches([[40.0, 320.0], [320.0, 320.0]], [[160.0, 30.0], [30.0, 30.0]], 0.01) == [True, False]

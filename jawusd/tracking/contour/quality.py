@@ -66,13 +66,14 @@ def uncovered_px(
     return uncovered, total
 
 
-def worth_px(solution: Solution, uncovered_px: Array, usual_px: Array, price: float) -> Array:
-    """Return the matched contour less the penalty for more uncovered mask than usual, per arch and view [px], (2, C).
+def penalised_score_px(solution: Solution, uncovered: Array, uncovered_price: float) -> Array:
+    """Return the matched contour less the penalty for uncovered mask, per arch and view [px], shape (2, C).
 
-    Where lips leave little of the contour visible, the usual errors of an outline would outweigh it. `price` is as
-    `uncovered_price` in `arch_fit`.
+    Args:
+        uncovered: number of uncovered pixels, shape (2, C).
+        uncovered_price: penalty of an uncovered pixel, in px of contour [1/px].
     """
-    return score_px(solution) - price * (uncovered_px - usual_px)
+    return score_px(solution) - uncovered_price * uncovered
 
 
 def coverage_error(uncovered: Array, total: Array) -> Array:
@@ -84,10 +85,10 @@ def arch_fit(scans: Sequence[Scan], solution: Solution, views: Sequence[View], u
     """Return the matched fraction of each arch's visible contour, less the penalty for uncovered mask, shape (2,) [-].
 
     The result is the median over the views, so that one wrong mask of three is ignored; -inf if nothing is visible.
-    `uncovered_price` is the penalty of an uncovered pixel in px of contour [1/px].
+    `uncovered_price` is as in `penalised_score_px`.
     """
     uncovered, _ = uncovered_px(scans, solution.poses, views)
-    shares = (score_px(solution) - uncovered_price * uncovered) / np.maximum(solution.visible_px, 1.0)
+    shares = penalised_score_px(solution, uncovered, uncovered_price) / np.maximum(solution.visible_px, 1.0)
     out = np.full(2, -np.inf)
     for r in ARCHES:
         seen = shares[r, solution.visible_px[r] > 0]

@@ -17,7 +17,7 @@ from jawusd.formats.capture import Capture
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry import Camera
 from jawusd.tracking.config import Mapper, TrackingConfig
-from jawusd.tracking.contour.quality import arch_fit, score_px, uncovered_px
+from jawusd.tracking.contour.quality import arch_fit, penalised_score_px, uncovered_px
 from jawusd.tracking.contour.scan import ARCH_NAMES, prepare_scan, teeth_centre
 from jawusd.tracking.contour.solver import ContourSolver
 from jawusd.tracking.contour.views import masked_sources
@@ -129,5 +129,5 @@ class _Sizes:
             views = masks.at(frame)
         end = self._solver.solve(start, views, config.wide_gates_px)
         uncovered, _ = uncovered_px(scans, end.poses, views)
-        objective = float((score_px(end) - config.uncovered_price * uncovered).sum())
+        objective = float(penalised_score_px(end, uncovered, config.uncovered_price).sum())
         return objective, float(arch_fit(scans, end, views, config.uncovered_price).min()), end.poses

@@ -13,7 +13,7 @@ from jawusd.formats.mesh import Mesh
 from jawusd.geometry import make_transform, se3_inverse, so3_exp, so3_log, transform_point, transform_points
 from jawusd.tracking.config import Mapper
 from jawusd.tracking.contour.equations import Solution
-from jawusd.tracking.contour.quality import arch_fit, score_px, uncovered_px
+from jawusd.tracking.contour.quality import arch_fit, penalised_score_px, uncovered_px
 from jawusd.tracking.contour.scan import ARCH_NAMES, ARCHES, prepare_scan, teeth_centre
 from jawusd.tracking.contour.solver import ContourSolver
 from jawusd.tracking.contour.views import View
@@ -190,7 +190,7 @@ class StartSearch:
         price = self._config.uncovered_price
         if solver is self._coarse_solver:
             price *= self._config.working_px_per_mm / _PX_PER_MM
-        return (score_px(solution) - price * uncovered).sum(1)
+        return penalised_score_px(solution, uncovered, price).sum(1)
 
 
 def _opened(crowns: Array, T_anatomical_scan: Array) -> list[Array]:

@@ -11,7 +11,7 @@ import numpy as np
 
 from jawusd.base.arrays import Array, Mask
 from jawusd.tracking.contour.equations import Solution
-from jawusd.tracking.contour.quality import coverage_error, matched_px, residual_px, score_px, worth_px
+from jawusd.tracking.contour.quality import coverage_error, matched_px, penalised_score_px, residual_px
 from jawusd.tracking.contour.rendering import Rendering
 from jawusd.tracking.contour.scan import ARCHES, CROWN
 from jawusd.tracking.contour.views import FEWEST_MASKS, View, present_masks
@@ -23,6 +23,7 @@ from jawusd.tracking.performance.views import Growth
 #: teeth [rad, mm, mm].
 LARGEST_SIGMA = np.r_[[0.3] * 3, [30.0] * 3, [10.0] * 3]
 _LEAST_MATCHED_PX = 15.0  # matched contour below which an arch is rejected [px]: 2 mm of tooth edge
+_BEST_STARTS = 3  # number of starts, chosen after a few alignment steps, that are aligned fully
 _TYPICAL_PX = 0.4  # typical residual of hand-drawn masks at the working resolution [px]
 _TYPICAL_UNCOVERED = 0.01  # fraction of a mask that good poses leave uncovered [-]
 
@@ -63,7 +64,7 @@ class Trial:
 
     def objective(self, price: float) -> float:
         """Return the score that ranks attempts: the matched contour minus the penalty for uncovered mask [px]."""
-        return float(np.where(self.use, score_px(self.solution) - price * self.uncovered_px, 0.0).sum())
+        return float(np.where(self.use, penalised_score_px(self.solution, self.uncovered_px, price), 0.0).sum())
 
     @property
     def uncovered(self) -> Array:
@@ -81,17 +82,17 @@ class Instant:
 
 
 class Usual(NamedTuple):
-    """What good alignments of a take leave, per arch."""
+    """Usual quality of good alignments, per arch."""
 
-    residual_px: Array  # residual [px], shape (2,)
-    uncovered: Array  # mean uncovered fraction of a mask [-], shape (2,)
+    residual_px: Array  # standard deviation of the residuals [px], shape (2,)
+    uncovered: Array  # mean uncovered fraction of the masks [-], shape (2,)
 
 
 class Attempts:
-    """Aligns single frames, and accepts or rejects results by comparison with the usual ones of the take."""
+    """Aligns single frames, and accepts or rejects results by comparison with the usual quality in the take."""
 
     def __init__(self, instants: InstantSolver, outline_weight: Array, usual: Usual | None = None) -> None:
-        """Prepare with the `outline_weight` of `InstantSolver.align`, and what is usual in the take."""
+        """Prepare with the `outline_weight` of `InstantSolver.align`, and the usual quality in the take, if known."""
         self.instants, self.config, self._weight = instants, instants.config, outline_weight
         self._aligned: deque[Usual] = deque(maxlen=self.config.history_frames)
         if usual is not None:
@@ -102,7 +103,7 @@ class Attempts:
         return Instant(views, self.instants.solver.rendering(views), present_masks(views))
 
     def remember(self, fit: FrameFit) -> None:
-        """Add a frame to the statistics of what is usual."""
+        """Add a frame to the statistics of the usual quality."""
         if fit.solution is not None and fit.found.all():
             self._aligned.append(usual_of([fit]))
 
@@ -125,8 +126,8 @@ class Attempts:
             uncovered[r, c] = (mask & (rendering.labels[c][r] != CROWN)).sum()
         return Trial(aligned.pose, aligned.solution, use, uncovered, total)
 
-    def best_starts(self, starts: Sequence[Pose], precision: Array, instant: Instant, count: int) -> list[Pose]:
-        """Return the start poses that fit best after a few steps, the best one first.
+    def best_starts(self, starts: Sequence[Pose], precision: Array, instant: Instant) -> list[Pose]:
+        """Return the few start poses that fit best after a few alignment steps, the best one first.
 
         `precision` (9,) is that of `Expected`, about each start.
         """
@@ -137,7 +138,7 @@ class Attempts:
             trial = self.attempt(start, expected, instant, instant.present, config.trial_gates_px)
             return trial.objective(config.uncovered_price)
 
-        return sorted(starts, key=score, reverse=True)[:count]
+        return sorted(starts, key=score, reverse=True)[:_BEST_STARTS]
 
     def bad(self, trial: Trial) -> Mask:
         """Return which arches do not fit their masks, shape (2,)."""
@@ -146,14 +147,15 @@ class Attempts:
         rough = ~(residual_px(trial.solution) <= c.lost_residual * c.suspect_residual * usual.residual_px)
         uncovered = np.where(trial.use, trial.uncovered, 0.0).max(1) > c.lost_coverage
         few = matched_px(trial.solution) < _LEAST_MATCHED_PX
-        usual_px = usual.uncovered[:, None] * trial.mask_px
-        worth = worth_px(trial.solution, trial.uncovered_px, usual_px, c.uncovered_price)
-        worthless = (trial.use & (worth <= 0.0)).any(1)
-        return np.asarray(trial.use.any(1) & (rough | uncovered | few | worthless))
+        # Pixels that are usually uncovered are exempt: errors of a long outline would outweigh a short matched contour.
+        unusual_px = trial.uncovered_px - usual.uncovered[:, None] * trial.mask_px
+        score = penalised_score_px(trial.solution, unusual_px, c.uncovered_price)
+        outweighed = (trial.use & (score <= 0.0)).any(1)
+        return np.asarray(trial.use.any(1) & (rough | uncovered | few | outweighed))
 
     @property
     def _usual(self) -> Usual:
-        """Return the medians over recent alignments; before the first one, any residual is usual."""
+        """Return the medians over recent alignments; before the first one, no residual is too large."""
         if not self._aligned:
             return Usual(np.full(2, np.inf), np.full(2, _TYPICAL_UNCOVERED))
         residuals, uncovered = zip(*self._aligned, strict=True)

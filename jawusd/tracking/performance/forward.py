@@ -16,9 +16,7 @@ from jawusd.tracking.performance.attempts import Attempts, FrameFit, Instant, Tr
 from jawusd.tracking.performance.coordinates import Pose
 from jawusd.tracking.performance.instant import Expected
 from jawusd.tracking.performance.motion import STEADY, Prediction
-from jawusd.tracking.performance.single_start import spread_out
-
-_JAWS, _FINALISTS = 32, 3  # numbers of jaw poses tried briefly, and of starts tried fully
+from jawusd.tracking.performance.single_start import JAWS, spread_out
 
 
 class ForwardPass:
@@ -40,7 +38,7 @@ class ForwardPass:
     @cached_property
     def _jaws(self) -> Array:
         """Jaw parameters over the whole range [mm], shape (n, 3); few walks need them."""
-        return spread_out(self._coordinates.jaw, _JAWS)
+        return spread_out(self._coordinates.jaw, JAWS)
 
     def _fit(self, expected: Expected, instant: Instant) -> FrameFit:
         attempts, config = self._attempts, self._attempts.config
@@ -78,7 +76,7 @@ class ForwardPass:
             poses = [self._coordinates.with_jaw(trial.pose, d, int(fitting[0])) for d in jaws]
         else:
             poses = [self._onto_masks(replace(expected.pose, d=d), instant) for d in jaws]
-        best = self._attempts.best_starts(poses, expected.precision, instant, _FINALISTS)
+        best = self._attempts.best_starts(poses, expected.precision, instant)
         return [expected.pose, self._motion.last, *best]
 
     def _onto_masks(self, pose: Pose, instant: Instant) -> Pose:

@@ -59,13 +59,14 @@ _GRID = Grid(
     reach_mm=(18.0, 7.5, 0.1),
 )
 _SHIFTS = np.stack(np.meshgrid(*[np.arange(-3, 3.1, 1.5)] * 2, [0.0], indexing="ij"), axis=-1).reshape(-1, 3)
-# Numbers per candidate width of head poses kept, of jaw poses tried with each of these, and of pairs of head and jaw
-# poses aligned in a few steps; numbers of pairs aligned fully, and at the working resolution. Each distance has its
-# share, since masks rank distances poorly before poses are aligned: near teeth cover more of them.
-_HEADS, _JAWS, _TRIED, _FINALISTS, _WINNERS = 17, 32, 12, 24, 5
+#: Number of jaw poses, over the whole range, that searches try.
+JAWS = 32
+# Numbers per candidate width of head poses kept, each with all jaw poses, and of pairs of head and jaw poses aligned in
+# a few steps; numbers of pairs aligned fully, and at the working resolution. Each distance has its share, since masks
+# rank distances poorly before poses are aligned: near teeth cover more of them.
+_HEADS, _TRIED, _FINALISTS, _WINNERS = 17, 12, 24, 5
 # Penalty per crown pixel outside the mask, in px of contour [1/px]: low, since lips may hide crowns.
 _OUTSIDE_PRICE = 0.05
-_JAWS_REFINED = 3  # number of jaw poses aligned fully if only one arch was found
 _DISTINCT_MM = 3.0  # minimum distance between head poses that are kept [mm], as mean displacement of the teeth
 _LEAST_FIT = 0.1  # fit of the worse arch below which a start is rejected [-]; it is accepted at once from CLEAR_FIT on
 _NEARBY = LARGEST_SIGMA / 3.0  # standard deviations of the true pose about a candidate pose [rad, mm, mm]
@@ -98,7 +99,7 @@ class SingleStart:
         rough = ContourSolver(self._coarse, small)
         self._rough = Attempts(InstantSolver(rough, Coordinates(jaw, self._coarse)), weight)
         self._fine = Attempts(InstantSolver(solver, Coordinates(jaw, solver.scans)), weight)
-        self._jaws = spread_out(jaw, _JAWS)
+        self._jaws = spread_out(jaw, JAWS)
 
     def find(self, footage: Footage) -> FoundPose:
         """Return the first start that fits clearly; without one, the start that fits best.
@@ -191,14 +192,17 @@ class SingleStart:
         return trial.objective(price) - outside, trial.pose
 
     def _refined(self, pose: Pose, views: Sequence[View], frame: int) -> FoundPose | None:
-        """Align a pose at working resolution; return None if an arch is not found."""
-        instant = self._fine.instant(views)
-        found = self._fine.near(pose, instant)
-        if found.found.sum() == 1:  # it may be in place already with the other one far off
+        """Align a pose at working resolution; return None if an arch is not found.
+
+        If only one arch is found, other jaw poses are tried around it.
+        """
+        fine, instant = self._fine, self._fine.instant(views)
+        found = fine.near(pose, instant)
+        if found.found.sum() == 1:
             arch = int(found.found.argmax())
-            starts = [self._fine.instants.coordinates.with_jaw(found.pose, d, arch) for d in self._jaws]
-            best = self._fine.best_starts(starts, _NEARBY**-2.0, instant, _JAWS_REFINED)
-            found = max((self._fine.near(start, instant) for start in best), key=lambda fit: fit.objective_px)
+            starts = [fine.instants.coordinates.with_jaw(found.pose, d, arch) for d in self._jaws]
+            best = fine.best_starts(starts, _NEARBY**-2.0, instant)
+            found = max((fine.near(start, instant) for start in best), key=lambda fit: fit.objective_px)
         if found.solution is None or not found.found.all():
             return None
         fit = arch_fit(self._fine.instants.solver.scans, found.solution, views, self._config.uncovered_price)

@@ -18,11 +18,11 @@ from jawusd.tracking.contour.quality import (
     coverage_error,
     crown_sigma_mm,
     matched_px,
+    penalised_score_px,
     residual_px,
     score_px,
     uncovered_px,
     view_residual_px,
-    worth_px,
 )
 from jawusd.tracking.contour.scan import ARCHES
 from jawusd.tracking.contour.solver import ContourSolver
@@ -47,7 +47,7 @@ class _Trial:
 
     def objective(self, price: float) -> Array:
         """Return the objective per arch and view: matched contour less the penalty for uncovered mask [px]."""
-        return score_px(self.solution) - price * np.where(self.use, self.uncovered, 0.0)
+        return penalised_score_px(self.solution, np.where(self.use, self.uncovered, 0.0), price)
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,17 +157,20 @@ class FrameTracker:
         """Return the masks that a scan does not fit although it fits at least `fewest` other masks, shape (2, C)."""
         dead = trial.use & (score_px(trial.solution) < self._config.dead_score * self.history.usual_score())
         uncovered = trial.use & (trial.coverage > self._config.lost_coverage)  # same limit as for a lost arch
-        wrong = self._badly_covered(trial) | uncovered | dead | self._worthless(trial)
+        wrong = self._badly_covered(trial) | uncovered | dead | self._outweighed(trial)
         for r in ARCHES:
             if (trial.use[r] & ~wrong[r]).sum() < fewest:
                 wrong[r] = False  # a wrong pose is more likely than so many wrong masks
         return wrong
 
-    def _worthless(self, trial: _Trial) -> Mask:
-        """Return the masks whose matched contour is worth less than what is unusually uncovered, shape (2, C)."""
-        usual_px = self.history.usual_coverage() * trial.mask_px
-        worth = worth_px(trial.solution, trial.uncovered, usual_px, self._config.uncovered_price)
-        return np.asarray(trial.use & (worth <= 0.0))
+    def _outweighed(self, trial: _Trial) -> Mask:
+        """Return the masks whose penalty exceeds their matched contour, shape (2, C).
+
+        Pixels that are usually uncovered are exempt: errors of a long outline would outweigh a short matched contour.
+        """
+        unusual_px = trial.uncovered - self.history.usual_coverage() * trial.mask_px
+        score = penalised_score_px(trial.solution, unusual_px, self._config.uncovered_price)
+        return np.asarray(trial.use & (score <= 0.0))
 
     def _losses(self, trial: _Trial) -> tuple[Loss, Loss]:
         """Return, for each arch, the first check that it fails."""

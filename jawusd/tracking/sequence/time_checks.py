@@ -18,7 +18,7 @@ from jawusd.base.arrays import Array, Mask
 from jawusd.formats.finding import Finding
 from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.contour.frame_record import FrameRecord, whole_frames
-from jawusd.tracking.contour.quality import score_px
+from jawusd.tracking.contour.quality import penalised_score_px
 from jawusd.tracking.contour.scan import CROWN
 from jawusd.tracking.contour.solver import ContourSolver
 from jawusd.tracking.contour.views import MaskViews, View, present_masks
@@ -152,7 +152,7 @@ def _judged(poses: Array, view: View, masks: Sequence[NDArray[np.uint8]], shown:
     for k, pair in enumerate(masks):
         found = solver.solve(poses, [replace(view, masks=pair)], (), shown[:, None], rendering=rendering)
         uncovered = ((pair > 127) & (rendering.labels[0] != CROWN)).sum((1, 2))
-        fits = score_px(found)[:, 0] - solver.config.uncovered_price * uncovered
+        fits = penalised_score_px(found, uncovered[:, None], solver.config.uncovered_price)[:, 0]
         out[k] = fits[shown].sum() / max(float(found.visible_px[shown].sum()), 1.0)
     return out
 
