@@ -11,7 +11,7 @@ import numpy as np
 
 from jawusd.base.arrays import Array, Mask
 from jawusd.tracking.contour.equations import Solution
-from jawusd.tracking.contour.quality import coverage_error, matched_px, penalised_score_px, residual_px
+from jawusd.tracking.contour.quality import coverage_error, matched_px, penalised_score_px, residual_px, view_residual_px
 from jawusd.tracking.contour.rendering import Rendering
 from jawusd.tracking.contour.scan import ARCHES, CROWN
 from jawusd.tracking.contour.views import FEWEST_MASKS, View, present_masks
@@ -144,7 +144,7 @@ class Attempts:
         """Return which arches do not fit their masks, shape (2,)."""
         c = self.config
         usual = self._usual
-        rough = ~(residual_px(trial.solution) <= c.lost_residual * c.suspect_residual * usual.residual_px)
+        rough = self.rough(trial.solution, trial.use).any(1)
         uncovered = np.where(trial.use, trial.uncovered, 0.0).max(1) > c.lost_coverage
         few = matched_px(trial.solution) < _LEAST_MATCHED_PX
         # Pixels that are usually uncovered are exempt: errors of a long outline would outweigh a short matched contour.
@@ -152,6 +152,14 @@ class Attempts:
         score = penalised_score_px(trial.solution, unusual_px, c.uncovered_price)
         outweighed = (trial.use & (score <= 0.0)).any(1)
         return np.asarray(trial.use.any(1) & (rough | uncovered | few | outweighed))
+
+    def rough(self, solution: Solution, use: Mask) -> Mask:
+        """Return which of the used masks fit far worse than is usual, shape (2, C).
+
+        Masks are judged one by one, since the others of the arch would conceal a wrong one.
+        """
+        allowed_px = self.config.lost_residual * self.config.suspect_residual * self._usual.residual_px[:, None]
+        return np.asarray(use & ~(view_residual_px(solution) <= allowed_px))
 
     @property
     def _usual(self) -> Usual:

@@ -115,12 +115,12 @@ class Smoother:
             fits = [self._moved(fit, pose, weight) for fit, pose in zip(fits, poses, strict=True)]
             if round_ == self._rounds:
                 break
-            if round_ == 0:
-                fits = self._found_again(fits, weight)
             for k, fit in enumerate(fits):
                 fits[k] = self._matched(fit, self._frames[k], state)
                 done(round_ * len(fits) + k + 1, total)
             weight = 1.0 / (outline_variance(fits, config) + self._shared_px3)
+            if round_ == 0:
+                fits = self._aligned_again(fits, weight)
         sigma = np.zeros(self._cameras)
         # The bound of the rig is omitted: it is an inequality, and would make the covariance too small.
         covariance, shared = self._covariance(self._system(fits, state, weight, motion, slow, None))
@@ -212,15 +212,20 @@ class Smoother:
         growth = None if matched is None else growth_of(matched, solution.poses, solution.centres, views)
         return replace(fit, solution=solution, growth=growth)
 
-    def _found_again(self, fits: list[FrameFit], weight: Array) -> list[FrameFit]:
-        """Repeat the alignment of arches that have masks but were not found, starting from smoothed poses."""
+    def _aligned_again(self, fits: list[FrameFit], weight: Array) -> list[FrameFit]:
+        """Repeat the alignment, from smoothed poses, where an arch was not found or one of its masks does not fit."""
         if self._views is None:
             return fits
         attempts = Attempts(self._instants, weight, usual_of(fits))
+
+        def doubtful(fit: FrameFit) -> bool:
+            several = fit.use.sum(1, keepdims=True) > 1  # a single mask cannot be left out
+            return fit.solution is not None and bool((attempts.rough(fit.solution, fit.use) & several).any())
+
         for k, fit in enumerate(fits):
-            if fit.missed.any():
+            if fit.missed.any() or doubtful(fit):
                 again = attempts.near(fit.pose, attempts.instant(self._views.at(self._frames[k])), _NEARBY)
-                if again.found.sum() > fit.found.sum():
+                if again.found.sum() > fit.found.sum() or (again.found >= fit.found).all() and not doubtful(again):
                     fits[k] = again
         return fits
 
