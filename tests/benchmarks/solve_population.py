@@ -5,7 +5,8 @@ other cameras, another motion and another annotator (see `draw_shot`). It is sol
 single camera is the front camera in a third of the shots, and a side camera in the others. For each number of cameras,
 the program prints:
 
-    known       fraction of frames that are solved with a sigma of the incisal point below 1 mm
+    known       fraction of frames with a sigma of the incisal point below 1 mm
+    both        fraction of frames that are known, and in which both arches were found
     error       error of the incisal point in known frames [mm]: mean, median and 90th percentile over shots
     worst       largest error of a known frame [mm]
     silent      fraction of known frames with an error above both 1 mm and 2 sigma
@@ -71,6 +72,7 @@ class Outcome:
     refused: str = ""
     frames: int = 0
     known: float = 0.0
+    both: float = 0.0
     error_mm: float = float("nan")
     worst_mm: float = float("nan")
     silent: float = 0.0
@@ -141,8 +143,9 @@ def judge(outcome: Outcome, found: Performance, jaw: JawRig, relative: np.ndarra
     """Write the figures of some frames of a solved shot to its outcome, from true poses of the jaw (F, 4, 4)."""
     gap = transform_point(jaw.pose(found.d), jaw.landmarks[0]) - transform_point(relative, jaw.landmarks[0])
     error, sigma = np.linalg.norm(gap, axis=-1), tracks_of(found, jaw).sigma_mm[:, 0]
-    known = (found.state == SolveState.SOLVED) & (sigma < KNOWN_MM)
+    known = sigma < KNOWN_MM
     outcome.frames, outcome.known = len(scored), float(known[scored].mean())
+    outcome.both = float((known & (found.state == SolveState.SOLVED))[scored].mean())
     known &= np.isin(np.arange(len(error)), scored)
     if known.any():
         away = (found.d - jaw.encode(relative)[0])[known]
@@ -195,7 +198,21 @@ def report(outcomes: list[Outcome]) -> None:
     for o in outcomes:
         if o.refused:
             print(f"person {o.seed} shot {o.draw}, {o.cameras} cameras: {o.refused[:160]}")
-    heads = ("shots", "known", "error", "median", "p90", "worst", "silent", "z2", "mean", "sigma", "starts", "core")
+    heads = (
+        "shots",
+        "known",
+        "both",
+        "error",
+        "median",
+        "p90",
+        "worst",
+        "silent",
+        "z2",
+        "mean",
+        "sigma",
+        "starts",
+        "core",
+    )
     print("cameras" + "".join(f"{head:>8}" for head in heads))
     for count in sorted({o.cameras for o in outcomes} - {0}):
         own = [o for o in outcomes if o.cameras == count]
@@ -207,7 +224,8 @@ def report(outcomes: list[Outcome]) -> None:
         error, z2 = np.array([o.error_mm for o in seen]), np.array([o.z2 for o in seen])
         weight, known = np.array([o.frames * o.known for o in seen]), np.mean([o.known for o in good])
         silent = np.average([o.silent for o in seen], weights=weight)
-        cells = [f"{len(own):8d}{100 * known:7.1f}%{error.mean():8.3f}{np.median(error):8.3f}"]
+        both = np.mean([o.both for o in good])
+        cells = [f"{len(own):8d}{100 * known:7.1f}%{100 * both:7.1f}%{error.mean():8.3f}{np.median(error):8.3f}"]
         cells += [f"{np.percentile(error, 90):8.3f}{max(o.worst_mm for o in seen):8.2f}{100 * silent:7.2f}%"]
         cells += [f"{np.median(z2):8.2f}{z2.mean():8.2f}{np.median([o.sigma_mm for o in seen]):8.3f}"]
         cells += [f"{len(good):8d}{np.nanmedian([o.core_s for o in good]):8.3f}"]
