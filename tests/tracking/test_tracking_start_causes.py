@@ -14,9 +14,13 @@ from jawusd.tracking.initialization.start_search import SearchResult
 TABLE = {camera.name: camera for camera in CAMERAS}
 
 
-@pytest.mark.parametrize(("without", "suspected"), [(np.nan, False), (0.02, True)])
-def test_exchanges_that_leave_cameras_without_masks_prove_nothing(monkeypatch, without, suspected):
-    """The masks of camera 1 are wrong; an exchange that removes them leaves correct ones, which proves nothing."""
+@pytest.mark.parametrize(
+    ("given", "without", "suspected"),
+    [((0.3, np.nan), np.nan, False), ((0.3, 0.2), 0.02, True), ((0.3, 0.02), 0.02, False), ((0.3, np.nan), 0.02, True)],
+    ids=["no masks after it", "exchanged", "one camera fits as given", "one camera has no masks"],
+)
+def test_exchanges_are_suspected_only_of_masks_that_do_not_fit(monkeypatch, given, without, suspected):
+    """Masks are given for cameras 1 and 2; an exchange of both leaves camera 1 with another uncovered fraction."""
     sources = [
         CameraSource(name=name, masks=Masks(upper=f"{name}/upper/%06d.png", lower=f"{name}/lower/%06d.png"))
         for name in ("cam0", "cam1", "cam2")
@@ -24,7 +28,7 @@ def test_exchanges_that_leave_cameras_without_masks_prove_nothing(monkeypatch, w
 
     def shares(footage, solver, poses, frame):
         named = [source.masks.upper.parts[0] for source in footage.sources]
-        return np.array([0.01, without, 0.02]) if named == ["cam0", "cam2", "cam1"] else np.array([0.01, 0.3, 0.02])
+        return np.array([0.01, without, 0.02]) if named == ["cam0", "cam2", "cam1"] else np.array([0.01, *given])
 
     monkeypatch.setattr(start_causes, "_uncovered_shares", shares)
     footage = Footage(sources, TABLE, OFFSETS, (0, 10))

@@ -65,7 +65,8 @@ def possible_exchanges(sources: Sequence[CameraSource]) -> list[MaskExchange]:
 def likely_exchange(footage: Footage, solver: ContourSolver, poses: Array, frame: int) -> MaskExchange | None:
     """Return the swap that best explains why masks lie outside their scans, with its evidence; None if no swap does.
 
-    `poses` are T_world_upper and T_world_lower of the frame, accurate to about 1 mm, shape (2, 4, 4).
+    A camera whose masks fit as given takes part in no swap. `poses` are T_world_upper and T_world_lower of the frame,
+    accurate to about 1 mm, shape (2, 4, 4).
     """
     given = _uncovered_shares(footage, solver, poses, frame)
     if not (given >= _ODD_SHARE).any():
@@ -80,7 +81,9 @@ def likely_exchange(footage: Footage, solver: ContourSolver, poses: Array, frame
             continue  # mask videos differ in length from the clips of the cameras to which they would be assigned
         # If a swap leaves a camera without masks in this frame, that does not count against the swap.
         both = np.isfinite(given) & np.isfinite(shares)
-        if (given[both] >= _ODD_SHARE).any():
+        changed = [one.masks != other.masks for one, other in zip(footage.files, exchange.sources, strict=True)]
+        fitting = given[changed] < _ODD_SHARE
+        if (given[both] >= _ODD_SHARE).any() and not fitting.any():
             found.append((float(shares[both].mean()), float(given[both].mean()), exchange))
     if not found:
         return None

@@ -11,7 +11,13 @@ import numpy as np
 
 from jawusd.base.arrays import Array, Mask
 from jawusd.tracking.contour.equations import Solution
-from jawusd.tracking.contour.quality import coverage_error, matched_px, penalised_score_px, residual_px, view_residual_px
+from jawusd.tracking.contour.quality import (
+    coverage_error,
+    matched_px,
+    penalised_score_px,
+    residual_px,
+    view_residual_px,
+)
 from jawusd.tracking.contour.rendering import Rendering
 from jawusd.tracking.contour.scan import ARCHES, CROWN
 from jawusd.tracking.contour.views import FEWEST_MASKS, View, present_masks
