@@ -22,6 +22,7 @@ from jawusd.tracking.contour.solver import ContourSolver
 from jawusd.tracking.performance import smoother
 from jawusd.tracking.performance.attempts import FrameFit
 from jawusd.tracking.performance.coordinates import JAW, LOCAL, Coordinates, Pose
+from jawusd.tracking.performance.forward import ForwardPass
 from jawusd.tracking.performance.instant import Equations, Expected, InstantSolver, bound_equations
 from jawusd.tracking.performance.smoother import Smoother
 
@@ -77,19 +78,46 @@ def test_sigma_covers_what_a_biased_annotator_does_to_depth(jaw, scans, truth, t
     assert z2() > 4
 
 
+def with_patch(mask):
+    """Return a mask with a large patch beside the teeth."""
+    rows, columns = np.nonzero(mask)
+    return cv2.circle(mask.copy(), (int(columns.max()), int(rows.max())), int(np.ptp(columns)) // 3, 255, -1)
+
+
+def eroded(mask):
+    """Return a mask whose outline lies 7 px inside of the teeth, which it does not leave uncovered."""
+    return np.where(cv2.distanceTransform(mask, cv2.DIST_L2, 5) > 7, 255, 0).astype(np.uint8)
+
+
+@pytest.mark.parametrize("change", [with_patch, eroded])
 @pytest.mark.parametrize(("count", "most_mm"), [(3, 0.1), (2, 0.3)])
-def test_a_wrong_mask_in_one_of_several_cameras_costs_no_frame(jaw, scans, truth, folder, tmp_path, count, most_mm):
-    """A mask with a large patch beside the teeth is left out; the other masks of the frame are used."""
+def test_a_wrong_mask_in_one_of_several_cameras_costs_no_frame(
+    jaw, scans, truth, folder, tmp_path, count, most_mm, change
+):
+    """The wrong mask is left out; the other masks of the frame are used."""
     spoilt, k = shutil.copytree(folder, tmp_path / "spoilt"), 8
     path = small_take.png(spoilt, "cam1", "lower", k)
-    mask = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-    rows, columns = np.nonzero(mask)
-    cv2.circle(mask, (int(columns.max()), int(rows.max())), int(np.ptp(columns)) // 3, 255, -1)
-    cv2.imwrite(str(path), mask)
+    cv2.imwrite(str(path), change(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)))
     found = solved(jaw, scans, truth, spoilt, small_take.CAMERAS[:count])
     assert found.state[k] == SolveState.SOLVED and tip_error_mm(jaw, found, truth)[k] < most_mm
     unused = np.argwhere(~found.use[seen()])
     np.testing.assert_array_equal(unused, [[np.flatnonzero(seen() == k)[0], 1, 1]])
+
+
+def test_a_wrong_mask_that_the_first_pass_used_is_left_out_later(jaw, scans, truth, folder, tmp_path, monkeypatch):
+    spoilt, k = shutil.copytree(folder, tmp_path / "spoilt"), 8
+    path = small_take.png(spoilt, "cam1", "lower", k)
+    cv2.imwrite(str(path), eroded(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)))
+
+    def everything_used(self, expected, instant):
+        attempts = self._attempts
+        trial = attempts.attempt(expected.pose, expected, instant, instant.present, attempts.config.wide_gates_px)
+        return FrameFit(trial.pose, trial.solution, trial.use, instant.present, trial.uncovered)
+
+    monkeypatch.setattr(ForwardPass, "_fit", everything_used)
+    found = solved(jaw, scans, truth, spoilt, small_take.CAMERAS[:2])
+    assert not found.use[k, 1, 1] and found.use[k].sum() == 3
+    assert tip_error_mm(jaw, found, truth)[k] < 0.3
 
 
 def test_a_jaw_that_the_rig_cannot_reproduce_moves_no_head(jaw, scans, truth, tmp_path):

@@ -315,11 +315,14 @@ def test_the_table_is_read_as_parameters(performance, tmp_path):
     assert lines[5].endswith("inside,carried") and lines[-1].endswith("off the model; outside,solved")
 
 
-def bad_arches(score_px, uncovered_px, usual):
-    """Return which arches of a trial do not fit; only contour and uncovered pixels of the masks, (2, C), matter."""
+def bad_arches(score_px, uncovered_px, usual, residual_px=1.0):
+    """Return which arches of a trial do not fit, from contour, uncovered pixels and residuals of the masks, (2, C).
+
+    Residuals of 1 px are usual.
+    """
     score_px, uncovered_px = np.array(score_px), np.array(uncovered_px)
     outline = OutlineSums.zeros(score_px.shape[1])._replace(
-        score_px=score_px, matched_px=1.5 * score_px, weight=np.ones(score_px.shape)
+        score_px=score_px, matched_px=1.5 * score_px, weight=score_px, square=score_px * np.square(residual_px)
     )
     trial = Trial(
         pose=Pose(np.eye(4), np.zeros(3)),
@@ -343,3 +346,9 @@ def test_an_arch_is_lost_if_the_penalty_of_a_mask_exceeds_its_matched_contour(un
 
 def test_the_penalty_of_one_mask_is_not_balanced_by_the_contour_of_another():
     assert bad_arches([[40.0, 320.0], [320.0, 320.0]], [[160.0, 30.0], [30.0, 30.0]], 0.01) == [True, False]
+
+
+@pytest.mark.parametrize(("residual_px", "bad"), [(1.4, False), (2.2, True)])
+def test_the_residuals_of_one_mask_are_not_balanced_by_those_of_another(residual_px, bad):
+    residuals = [[1.0, residual_px], [1.0, 1.0]]
+    assert bad_arches([[320.0, 40.0], [320.0, 320.0]], np.full((2, 2), 30.0), 0.01, residuals) == [bad, False]
