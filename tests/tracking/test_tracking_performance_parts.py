@@ -318,7 +318,7 @@ def test_the_table_is_read_as_parameters(performance, tmp_path):
 def bad_arches(score_px, uncovered_px, usual, residual_px=1.0):
     """Return which arches of a trial do not fit, from contour, uncovered pixels and residuals of the masks, (2, C).
 
-    Residuals of 1 px are usual.
+    Residuals of 1 px, and matches of half of the visible 640 px, are usual.
     """
     score_px, uncovered_px = np.array(score_px), np.array(uncovered_px)
     outline = OutlineSums.zeros(score_px.shape[1])._replace(
@@ -326,13 +326,13 @@ def bad_arches(score_px, uncovered_px, usual, residual_px=1.0):
     )
     trial = Trial(
         pose=Pose(np.eye(4), np.zeros(3)),
-        solution=SimpleNamespace(outline=outline),
+        solution=SimpleNamespace(outline=outline, visible_px=np.full(score_px.shape, 640.0)),
         use=np.ones(score_px.shape, bool),
         uncovered_px=uncovered_px,
         mask_px=np.full(score_px.shape, 4000.0),
     )
     assert (trial.uncovered < TrackingConfig().lost_coverage).all()
-    usually = Usual(np.ones(2), np.full(2, usual))
+    usually = Usual(np.ones(2), np.full(2, usual), np.full(2, 0.5))
     return Attempts(SimpleNamespace(config=TrackingConfig()), np.ones(2), usually).bad(trial).tolist()
 
 
@@ -348,7 +348,11 @@ def test_the_penalty_of_one_mask_is_not_balanced_by_the_contour_of_another():
     assert bad_arches([[40.0, 320.0], [320.0, 320.0]], [[160.0, 30.0], [30.0, 30.0]], 0.01) == [True, False]
 
 
-@pytest.mark.parametrize(("residual_px", "bad"), [(1.4, False), (2.2, True)])
-def test_the_residuals_of_one_mask_are_not_balanced_by_those_of_another(residual_px, bad):
+@pytest.mark.parametrize(
+    ("score_px", "residual_px", "bad"),
+    [(40.0, 2.2, True), (40.0, 1.4, False), (280.0, 2.0, False)],
+    ids=["wrong mask", "closing lips", "wrong rig"],
+)
+def test_the_residuals_of_one_mask_are_not_balanced_by_those_of_another(score_px, residual_px, bad):
     residuals = [[1.0, residual_px], [1.0, 1.0]]
-    assert bad_arches([[320.0, 40.0], [320.0, 320.0]], np.full((2, 2), 30.0), 0.01, residuals) == [bad, False]
+    assert bad_arches([[320.0, score_px], [320.0, 320.0]], np.full((2, 2), 30.0), 0.01, residuals) == [bad, False]

@@ -16,6 +16,7 @@ from jawusd.tracking.contour.quality import (
     matched_px,
     penalised_score_px,
     residual_px,
+    score_px,
     view_residual_px,
 )
 from jawusd.tracking.contour.rendering import Rendering
@@ -32,6 +33,7 @@ _LEAST_MATCHED_PX = 15.0  # matched contour below which an arch is rejected [px]
 _BEST_STARTS = 3  # number of starts, chosen after a few alignment steps, that are aligned fully
 _TYPICAL_PX = 0.4  # typical residual of hand-drawn masks at the working resolution [px]
 _TYPICAL_UNCOVERED = 0.01  # fraction of a mask that good poses leave uncovered [-]
+_TYPICAL_SHARE = 0.5  # matched fraction of the visible contour at good poses [-]
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,6 +94,7 @@ class Usual(NamedTuple):
 
     residual_px: Array  # standard deviation of the residuals [px], shape (2,)
     uncovered: Array  # mean uncovered fraction of the masks [-], shape (2,)
+    share: Array  # matched fraction of the visible contour [-], shape (2,)
 
 
 class Attempts:
@@ -150,30 +153,36 @@ class Attempts:
         """Return which arches do not fit their masks, shape (2,)."""
         c = self.config
         usual = self._usual
-        rough = self.rough(trial.solution, trial.use).any(1)
+        rough = ~(residual_px(trial.solution) <= self._largest_residual_px)
+        wrong = self.wrong_masks(trial.solution, trial.use).any(1)
         uncovered = np.where(trial.use, trial.uncovered, 0.0).max(1) > c.lost_coverage
         few = matched_px(trial.solution) < _LEAST_MATCHED_PX
         # Pixels that are usually uncovered are exempt: errors of a long outline would outweigh a short matched contour.
         unusual_px = trial.uncovered_px - usual.uncovered[:, None] * trial.mask_px
         score = penalised_score_px(trial.solution, unusual_px, c.uncovered_price)
         outweighed = (trial.use & (score <= 0.0)).any(1)
-        return np.asarray(trial.use.any(1) & (rough | uncovered | few | outweighed))
+        return np.asarray(trial.use.any(1) & (rough | wrong | uncovered | few | outweighed))
 
-    def rough(self, solution: Solution, use: Mask) -> Mask:
-        """Return which of the used masks fit far worse than is usual, shape (2, C).
+    def wrong_masks(self, solution: Solution, use: Mask) -> Mask:
+        """Return which of the used masks fit far worse than is usual, and little of the contour, shape (2, C).
 
         Masks are judged one by one, since the others of the arch would conceal a wrong one.
         """
-        allowed_px = self.config.lost_residual * self.config.suspect_residual * self._usual.residual_px[:, None]
-        return np.asarray(use & ~(view_residual_px(solution) <= allowed_px))
+        rough = ~(view_residual_px(solution) <= self._largest_residual_px[:, None])
+        shares = score_px(solution) / np.maximum(solution.visible_px, 1.0)
+        return np.asarray(use & rough & (shares < self.config.alarming_score * self._usual.share[:, None]))
+
+    @property
+    def _largest_residual_px(self) -> Array:
+        """Return the largest acceptable standard deviation of an arch's residuals [px], shape (2,)."""
+        return self.config.lost_residual * self.config.suspect_residual * self._usual.residual_px
 
     @property
     def _usual(self) -> Usual:
         """Return the medians over recent alignments; before the first one, no residual is too large."""
         if not self._aligned:
-            return Usual(np.full(2, np.inf), np.full(2, _TYPICAL_UNCOVERED))
-        residuals, uncovered = zip(*self._aligned, strict=True)
-        return Usual(np.median(residuals, axis=0), np.median(uncovered, axis=0))
+            return Usual(np.full(2, np.inf), np.full(2, _TYPICAL_UNCOVERED), np.full(2, _TYPICAL_SHARE))
+        return Usual(*(np.median(values, axis=0) for values in zip(*self._aligned, strict=True)))
 
     def without_wrong_masks(self, trial: Trial, expected: Expected, instant: Instant) -> Trial:
         """Leave out a single mask of each arch that does not fit, if the arch then fits its other masks.
@@ -217,13 +226,22 @@ def empty_fit(pose: Pose, instant: Instant) -> FrameFit:
 
 def usual_of(fits: Iterable[FrameFit]) -> Usual:
     """Return the medians over the fits in which an arch was found; typical values if there is none."""
-    listed = [(residual_px(fit.solution), _mean_uncovered(fit), fit.found) for fit in fits if fit.solution is not None]
+    listed = [
+        (residual_px(fit.solution), _mean_uncovered(fit), _share(fit.solution), fit.found)
+        for fit in fits
+        if fit.solution is not None
+    ]
 
     def median(column: int, typical: float) -> Array:
-        values = [[row[column][r] for row in listed if row[2][r]] for r in ARCHES]
+        values = [[row[column][r] for row in listed if row[-1][r]] for r in ARCHES]
         return np.array([np.median(own) if own else typical for own in values])
 
-    return Usual(median(0, _TYPICAL_PX), median(1, _TYPICAL_UNCOVERED))
+    return Usual(*(median(k, typical) for k, typical in enumerate((_TYPICAL_PX, _TYPICAL_UNCOVERED, _TYPICAL_SHARE))))
+
+
+def _share(solution: Solution) -> Array:
+    """Return the matched fraction of the visible contour of each arch [-], shape (2,)."""
+    return np.asarray(score_px(solution).sum(1) / np.maximum(solution.visible_px.sum(1), 1.0))
 
 
 def _mean_uncovered(fit: FrameFit) -> Array:

@@ -220,7 +220,7 @@ class Smoother:
 
         def doubtful(fit: FrameFit) -> bool:
             several = fit.use.sum(1, keepdims=True) > 1  # a single mask cannot be left out
-            return fit.solution is not None and bool((attempts.rough(fit.solution, fit.use) & several).any())
+            return fit.solution is not None and bool((attempts.wrong_masks(fit.solution, fit.use) & several).any())
 
         for k, fit in enumerate(fits):
             if fit.missed.any() or doubtful(fit):
