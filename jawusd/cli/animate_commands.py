@@ -186,7 +186,7 @@ def arkit_table(
     clamped = [row for row in rows if row.clamped_mm > _CLAMPED_MM]
     lines = [f"{out}: {len(rows)} rows"]
     lines += [f"{row.shape} {row.weight:g} lay {row.clamped_mm:.2f} mm outside the bound" for row in clamped]
-    emit({"file": str(out), "rows": len(rows), "clamped": len(clamped)}, as_json, lambda: lines)
+    emit({"file": str(out), "rows": len(rows), "clamped": len(clamped)}, as_json, lines)
 
 
 def rate_of(rig: Path, prim: str | None) -> float:

@@ -81,11 +81,11 @@ def build(
     )
     if dry_run:
         plan = stages.plan_build(capture, out, options)
-        emit({"stages": [asdict(stage) for stage in plan]}, as_json, lambda: plan_lines(plan))
+        emit({"stages": [asdict(stage) for stage in plan]}, as_json, plan_lines(plan))
         return
     with progress() as report:
         summary = stages.build(capture, out, options, report, lambda found: say(found.line(), err=True))
-    emit(summary, as_json, lambda: build_lines(summary, verbose))
+    emit(summary, as_json, build_lines(summary, verbose))
 
 
 def track(
@@ -131,7 +131,7 @@ def track(
         )
     summary = stage.track_summary(tracks)
     found = {**summary, "file": str(out), "overlay": [str(path) for path in drawn]}
-    emit(found, as_json, lambda: track_lines(summary))
+    emit(found, as_json, track_lines(summary))
 
 
 def _check_backend(solver: Solver, backend: Backend) -> None:
@@ -175,7 +175,7 @@ def fit(
         fitted = fit_subject(subject, motion, model, report, fps)
     save_model(out, fitted)
     summary = fit_summary(fitted)
-    emit({**summary, "file": str(out)}, as_json, lambda: fit_lines(summary))
+    emit({**summary, "file": str(out)}, as_json, fit_lines(summary))
 
 
 def bake(
@@ -203,7 +203,7 @@ def bake(
     check_same_jaw(subject, loaded)
     with progress() as report:
         files = bake_subject(subject, loaded, out, report, fps=fps, table_size=table, prim_name=prim_name)
-    emit({"files": files}, as_json, lambda: [str(path) for path in files])
+    emit({"files": files}, as_json, [str(path) for path in files])
 
 
 def demo(
@@ -278,6 +278,6 @@ def build_many(
     with stopped_by_signals():
         outcomes = many.build_many(load_capture_list(captures), out, options, lambda line: say(line, err=True))
     data = {"folder": str(out), "builds": [asdict(outcome) for outcome in outcomes]}
-    emit(data, as_json, lambda: outcome_lines(outcomes))
+    emit(data, as_json, outcome_lines(outcomes))
     if any(outcome.status == many.FAILED for outcome in outcomes):
         raise typer.Exit(1)

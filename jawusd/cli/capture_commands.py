@@ -42,7 +42,7 @@ def init(
         start = start_capture(folder, square_mm, fps, report)
     write_start(start)
     found = {"file": str(start.path), "found": start.found, "notes": start.notes, "missing": start.missing}
-    emit(found, as_json, lambda: start_lines(start))
+    emit(found, as_json, start_lines(start))
     if start.missing:
         raise typer.Exit(1)
 
@@ -52,7 +52,7 @@ def _print_reference(as_json: bool) -> None:
     from jawusd.formats.capture_keys import reference_lines
 
     keys = capture_keys()
-    emit({"keys": [asdict(entry) for entry in keys]}, as_json, lambda: reference_lines(keys, 80))
+    emit({"keys": [asdict(entry) for entry in keys]}, as_json, reference_lines(keys, 80))
 
 
 def doctor(as_json: Json = False) -> None:
@@ -64,7 +64,7 @@ def doctor(as_json: Json = False) -> None:
     from jawusd.pipeline.check import examine
 
     found = examine()
-    emit(found, as_json, lambda: examined_lines(found))
+    emit(found, as_json, examined_lines(found))
     if found["problems"]:
         raise typer.Exit(1)
 
@@ -98,7 +98,7 @@ def cameras(
     refuse_existing(out, force)
     found, files = convert_cameras(source, out, unit_mm, given)
     data = {"cameras": [camera.name for camera in found], "files": [str(path) for path in files]}
-    emit(data, as_json, lambda: camera_lines(found, files))
+    emit(data, as_json, camera_lines(found, files))
 
 
 def check(capture: CaptureArg, allow_outside: Outside = False, as_json: Json = False) -> None:
@@ -113,7 +113,7 @@ def check(capture: CaptureArg, allow_outside: Outside = False, as_json: Json = F
         findings = check_capture(capture, allow_outside=allow_outside, progress=report)
     errors, warnings = (sum(found.severity == kind for found in findings) for kind in ("error", "warning"))
     listed = {"capture": str(capture), "findings": [finding.as_json() for finding in findings]}
-    emit({**listed, "errors": errors, "warnings": warnings}, as_json, lambda: check_lines(findings))
+    emit({**listed, "errors": errors, "warnings": warnings}, as_json, check_lines(findings))
     if errors:
         raise typer.Exit(CaptureError.exit_code)
 
@@ -138,7 +138,7 @@ def calibrate(
     found = {**summary, "file": str(out)}
     if report_file is not None:
         write_text_atomic(report_file, json.dumps(plain(found), indent=1) + "\n")
-    emit(found, as_json, lambda: [*calibration_lines(summary), str(out)])
+    emit(found, as_json, [*calibration_lines(summary), str(out)])
 
 
 def sync(
@@ -190,7 +190,7 @@ def sync(
             write_sync_plot(plot, found, result)
     if result is None:
         raise failure or SyncError("the cameras could not be aligned")
-    emit(result, as_json, lambda: sync_lines(result))
+    emit(result, as_json, sync_lines(result))
 
 
 def _named(clips: list[Path]) -> dict[str, Path]:
@@ -233,7 +233,7 @@ def segment(
         offsets = sync_cameras(opened, report)["offsets"]
         entries = segment_teeth(opened, offsets, out, SegmentOptions(keys, resume, jobs), report)
         summary = write_summary(opened, entries, out)
-    emit(summary, as_json, lambda: segment_lines(summary))
+    emit(summary, as_json, segment_lines(summary))
 
 
 def _refuse_masks(folder: Path, record: Path, force: bool) -> None:
@@ -269,7 +269,7 @@ def scans(
 
     with progress() as report:
         summary = label_scans(capture, out, force=force, allow_outside=allow_outside, progress=report)
-    emit(summary, as_json, lambda: scans_lines(summary))
+    emit(summary, as_json, scans_lines(summary))
 
 
 def plates(
@@ -293,7 +293,7 @@ def plates(
         offsets = sync_cameras(opened, report)["offsets"]
         patterns = write_plates(opened, offsets, frames, rig, report)
     found = {"folder": str(rig), "frames": [int(frames[0]), int(frames[-1])], "plates": patterns}
-    emit(found, as_json, lambda: [str(rig / pattern) for pattern in patterns])
+    emit(found, as_json, [str(rig / pattern) for pattern in patterns])
 
 
 def photos(
@@ -319,6 +319,6 @@ def photos(
 
     with progress() as report:
         found = align_photograph_files(outlines, upper_teeth, lower_teeth, out, force=force, progress=report)
-    emit({**found.result.as_json(), "file": str(found.file)}, as_json, lambda: photograph_lines(found))
+    emit({**found.result.as_json(), "file": str(found.file)}, as_json, photograph_lines(found))
     if any(finding.severity == "error" for finding in found.result.findings):
         raise typer.Exit(TrackingError.exit_code)

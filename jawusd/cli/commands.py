@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import importlib
 import itertools
 import re
@@ -314,13 +315,8 @@ class Commands(TyperGroup):
 class _Loaded(Mapping[str, TyperCommand]):
     """The commands by name; looking one up loads its module."""
 
-    def __init__(self) -> None:
-        self._found: dict[str, TyperCommand] = {}
-
     def __getitem__(self, name: str) -> TyperCommand:
-        if name not in self._found:
-            self._found[name] = _load(name, _MODULES[name])
-        return self._found[name]
+        return _load(name, _MODULES[name])
 
     def __iter__(self) -> Iterator[str]:
         return iter(_MODULES)
@@ -329,6 +325,7 @@ class _Loaded(Mapping[str, TyperCommand]):
         return len(_MODULES)
 
 
+@functools.cache
 def _load(name: str, module: str) -> TyperCommand:
     function = getattr(importlib.import_module(f"jawusd.cli.{module}_commands"), name.replace("-", "_"))
     alone = typer.Typer(add_completion=False, rich_markup_mode=None)

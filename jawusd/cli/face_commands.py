@@ -3,24 +3,21 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NamedTuple
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 import typer
-from numpy.typing import NDArray
 
 import jawusd
-from jawusd.base.arrays import Array
 from jawusd.base.errors import naming_file
 from jawusd.cli.animate_commands import rate_of
 from jawusd.cli.animate_commands import read_face as read_arkit_motion
 from jawusd.cli.options import Allow, Force, Json, Prim, RigArg, UnitOption, rigid_bodies
-from jawusd.cli.output import emit, refuse_any
+from jawusd.cli.output import emit
 from jawusd.evaluator import JawRig
 from jawusd.evaluator.skin import Skin
-from jawusd.evaluator.verdicts import INSIDE, Verdicts
 from jawusd.formats.alignment import Alignment, load_alignment, load_correspondences, save_alignment
 from jawusd.formats.atomic import refuse_existing
 from jawusd.formats.face_table import FaceTable, header_of
@@ -163,7 +160,7 @@ def _learn(
     learn = learn_jaw_weights if weights else learn_skin
     skin, offset_s = learn(loaded, jaw, face, offset, head_error)
     jawusd.save_skin(out, skin)
-    emit({"file": str(out), "offset_s": offset_s, **skin.meta}, as_json, lambda: _skin_lines(out, skin, offset_s))
+    emit({"file": str(out), "offset_s": offset_s, **skin.meta}, as_json, _skin_lines(out, skin, offset_s))
 
 
 def _skin_lines(out: Path, skin: Skin, offset_s: float) -> list[str]:
@@ -212,7 +209,7 @@ def align(
             joint=given.joint,
         )
     save_alignment(out, found)
-    emit({"file": str(out), **found.model_dump(mode="json")}, as_json, lambda: _align_lines(out, found, given.scale))
+    emit({"file": str(out), **found.model_dump(mode="json")}, as_json, _align_lines(out, found, given.scale))
 
 
 def _align_lines(out: Path, found: Alignment, scale: bool) -> list[str]:
@@ -240,76 +237,27 @@ StripOption = Annotated[
     Path | None,
     typer.Option(help="For --face: image to write (PNG): green is inside, amber within the tolerance, red invalid."),
 ]
-#: Exit code of a negative result, such as an invalid pose or a rig with errors.
-NO = 1
 
 
-class FaceOptions(NamedTuple):
-    """The options of `jawusd validate --face`."""
-
-    align: Path | None
-    mapping: Path | None
-    csv: Path | None
-    strip: Path | None
-    force: bool
-    residual_mm: float | None
-    tolerance_mm: float | None
-
-
-def validate_face(rig: Path, face: Path, options: FaceOptions, prim: str | None, as_json: bool) -> None:
-    """Print the verdicts on a face track, and write their table and strip; exit code 1 if a frame is invalid."""
-    from jawusd.fitting.face_judging import save_verdicts
-
-    refuse_any(options.force, options.csv, options.strip)
-    judged = _judged(jawusd.load(rig, prim=prim), face, options)
-    verdicts = judged.verdicts
-    if options.csv is not None:
-        save_verdicts(options.csv, judged)
-    if options.strip is not None:
-        from jawusd.report.figures import save_strip
-
-        save_strip(options.strip, judged.frames, verdicts)
-    rows, counts, words = counted(judged.frames, verdicts)
-    widened = f"{judged.widened_mm:.2f} mm for the alignment"
-    summary = f"{len(rows)} frames: {words} (tolerance {verdicts.tolerance_mm:.2f} mm, of which {widened})"
-    result = {"frames": len(rows), **counts, "widened_mm": judged.widened_mm, "verdicts": rows}
-    emit(result, as_json, lambda: [*verdict_lines(rows), summary])
-    if counts["invalid"]:
-        raise typer.Exit(NO)
-
-
-def _judged(rig: JawRig, face: Path, options: FaceOptions) -> JudgedFace:
+def judge_face(
+    rig: JawRig,
+    face: Path,
+    align: Path | None,
+    mapping: Path | None,
+    residual_mm: float | None,
+    tolerance_mm: float | None,
+) -> JudgedFace:
+    """Judge a face track against a rig: jaw poses by means of an alignment, or ARKit weights."""
     from jawusd.fitting.face_judging import JudgedFace, judge_jaw_track
 
     if face.suffix.lower() == ".csv" and "timecode" in header_of(face):
-        if options.align is not None:
+        if align is not None:
             raise typer.BadParameter("does not apply to ARKit weights.", param_hint="--align")
-        motion = read_arkit_motion(rig, face, None, options.mapping)
+        motion = read_arkit_motion(rig, face, None, mapping)
         known = np.isfinite(motion.d).all(axis=1)
         T = rig.pose(motion.d[known])
-        verdicts = rig.validate(T, residual_limit_mm=options.residual_mm, tolerance_mm=options.tolerance_mm)
+        verdicts = rig.validate(T, residual_limit_mm=residual_mm, tolerance_mm=tolerance_mm)
         return JudgedFace(motion.frames[known], verdicts, np.zeros(int(known.sum())), 0.0)
-    if options.align is None:
+    if align is None:
         raise typer.BadParameter("is needed: write it with `jawusd align`.", param_hint="--align")
-    return judge_jaw_track(rig, face, load_alignment(options.align), options.residual_mm, options.tolerance_mm)
-
-
-def counted(
-    frames: Array | NDArray[np.int64], verdicts: Verdicts
-) -> tuple[list[dict[str, object]], dict[str, int | float], str]:
-    """Return the verdicts on frames (F,) as rows for JSON, and their counts for JSON and in words."""
-    figures = (frames, verdicts.valid, verdicts.words(), verdicts.residual_mm, verdicts.margin_mm)
-    rows: list[dict[str, object]] = [
-        {"frame": int(frame), "valid": bool(ok), "reason": words, "residual_mm": float(res), "margin_mm": float(margin)}
-        for frame, ok, words, res, margin in zip(*figures, strict=True)
-    ]
-    inside, valid = int((verdicts.valid & verdicts.inside()).sum()), int(verdicts.valid.sum())
-    counts = {"inside": inside, "within_tolerance": valid - inside, "invalid": len(rows) - valid}
-    words = f"{inside} inside, {valid - inside} within tolerance, {len(rows) - valid} invalid"
-    return rows, {**counts, "tolerance_mm": verdicts.tolerance_mm}, words
-
-
-def verdict_lines(rows: Sequence[Mapping[str, object]]) -> list[str]:
-    """Return a line for each frame that is not inside the bound."""
-    shown = "frame {frame}: {reason} (residual {residual_mm:.2f} mm, margin {margin_mm:.2f} mm)"
-    return [shown.format(**row) for row in rows if row["reason"] != INSIDE]
+    return judge_jaw_track(rig, face, load_alignment(align), residual_mm, tolerance_mm)

@@ -49,29 +49,16 @@ def retarget(
     as_json: Json = False,
 ) -> None:
     """Retarget a motion to another rig, or make a rig for a subject from landmarks and a library."""
-    others = (landmarks, library_folder)
-    if anim and source and target and not any(others):
-        _retarget_motion(anim, source, target, prim, fps, out or Path("retargeted.usdc"), force, as_json)
-    elif landmarks and library_folder and not any((anim, source, target, fps)):
+    if landmarks and library_folder and not any((anim, source, target, fps)):
         _personal(landmarks, library_folder, use, out or Path("model.npz"), force, as_json)
-    else:
+        return
+    if not (anim and source and target) or landmarks or library_folder:
         raise typer.BadParameter("give either ANIM with --from and --to, or --landmarks with --library.")
-
-
-def _retarget_motion(
-    anim: Path,
-    source: Path,
-    target: Path,
-    prim: str | None,
-    fps: float | None,
-    out: Path,
-    force: bool,
-    as_json: bool,
-) -> None:
     from jawusd.pipeline.library import load_any_rig
     from jawusd.rig import write_animation
     from jawusd.rig.read import describe
 
+    out = out or Path("retargeted.usdc")
     refuse_existing(out, force)
     for place, option in ((out, "--out"), (target, "--to")):
         if place.suffix not in (".usd", ".usda", ".usdc"):
@@ -94,14 +81,10 @@ def _personal(landmarks: Path, folder: Path, use: Use, out: Path, force: bool, a
     save_model(out, made.model)
     known, weights = fit_summary(made.model), made.motion.weights
     ranges, warnings, not_used = known["ranges_mm"], known["warnings"], [*made.left_out, *opened.skipped]
-
-    def lines() -> list[str]:
-        found = [str(out), *(f"  {name}: {low:.1f} .. {high:.1f} mm" for name, (low, high) in ranges.items())]
-        heaviest = sorted(weights.items(), key=lambda item: -item[1])
-        found += [f"  from {name}: {weight:.0%}" for name, weight in heaviest]
-        found += [f"  not used: {name}" for name in not_used]
-        return found + [f"  {warning['code']}: {warning['message']}" for warning in warnings]
-
+    lines = [str(out), *(f"  {name}: {low:.1f} .. {high:.1f} mm" for name, (low, high) in ranges.items())]
+    lines += [f"  from {name}: {weight:.0%}" for name, weight in sorted(weights.items(), key=lambda item: -item[1])]
+    lines += [f"  not used: {name}" for name in not_used]
+    lines += [f"  {warning['code']}: {warning['message']}" for warning in warnings]
     rest = {"ranges_mm": ranges, "not_used": not_used, "warnings": warnings}
     emit({"file": str(out), "use": use, **made.header, **rest}, as_json, lines)
 
@@ -152,7 +135,7 @@ def library(
     plots = [] if plot is None else [str(path) for path in plot_ranges(entries, plot, force)]
     rigs = [asdict(entry) | ({"landmark_distance_mm": apart_mm[entry.path]} if apart_mm else {}) for entry in entries]
     listed = {"folder": str(opened.folder), "reread": opened.reread, "rigs": rigs, "skipped": opened.skipped}
-    emit({**listed, "plots": plots}, as_json, lambda: [*_library_lines(opened, entries, apart_mm), *plots])
+    emit({**listed, "plots": plots}, as_json, [*_library_lines(opened, entries, apart_mm), *plots])
 
 
 def _library_lines(opened: Library, entries: Sequence[Entry], apart_mm: Mapping[str, float]) -> list[str]:
@@ -168,22 +151,11 @@ def _library_lines(opened: Library, entries: Sequence[Entry], apart_mm: Mapping[
 
 
 def _compare(first: Entry, second: Entry, as_json: bool) -> None:
-    def numbers(entry: Entry) -> dict[str, float]:
-        ends = {f"{key}_{end}": entry.ranges_mm[key][i] for key in PARAMETERS for i, end in enumerate(("min", "max"))}
-        return {
-            **ends,
-            "condylar_distance": entry.condylar_distance_mm,
-            "condyle_incisor": entry.condyle_incisor_mm,
-        }
-
-    a, b = numbers(first), numbers(second)
+    a, b = _measures(first), _measures(second)
     apart_mm = landmark_distance_mm(first.landmarks(), second.landmarks())
-
-    def lines() -> list[str]:
-        head = f"{'[mm]':<22}{first.actor[:15]:>16}{second.actor[:15]:>16}{'difference':>12}"
-        rows = [f"{key:<22}{a[key]:16.2f}{b[key]:16.2f}{b[key] - a[key]:+12.2f}" for key in a]
-        return [head, *rows, f"landmarks differ by {apart_mm:.2f} mm rms after the best rigid fit"]
-
+    lines = [f"{'[mm]':<22}{first.actor[:15]:>16}{second.actor[:15]:>16}{'difference':>12}"]
+    lines += [f"{key:<22}{a[key]:16.2f}{b[key]:16.2f}{b[key] - a[key]:+12.2f}" for key in a]
+    lines.append(f"landmarks differ by {apart_mm:.2f} mm rms after the best rigid fit")
     compared = {
         "first": first.path,
         "second": second.path,
@@ -192,6 +164,11 @@ def _compare(first: Entry, second: Entry, as_json: bool) -> None:
         "measures_mm": {key: {"first": a[key], "second": b[key], "difference": b[key] - a[key]} for key in a},
     }
     emit(compared, as_json, lines)
+
+
+def _measures(entry: Entry) -> dict[str, float]:
+    ends = {f"{key}_{end}": entry.ranges_mm[key][i] for key in PARAMETERS for i, end in enumerate(("min", "max"))}
+    return {**ends, "condylar_distance": entry.condylar_distance_mm, "condyle_incisor": entry.condyle_incisor_mm}
 
 
 def publish(
@@ -217,4 +194,4 @@ def publish(
         files = [str(write_package(out, source))]
     else:
         files = [str(path) for path in publish_rig(source, out, prefix, prim_name)]
-    emit({"files": files}, as_json, lambda: files)
+    emit({"files": files}, as_json, files)

@@ -117,7 +117,7 @@ def emit_motion(out: Path, rate: float, motion: AuthoredMotion, changes: Changes
     first, last = float(motion.frames[0]), float(motion.frames[-1])
     head, *rest = changes.lines
     result = {"file": str(out), "fps": rate, "frames": [first, last], **changes.figures}
-    emit(result, as_json, lambda: [f"{out}: frames {first:g} .. {last:g} at {rate:g} fps{head}", *rest])
+    emit(result, as_json, [f"{out}: frames {first:g} .. {last:g} at {rate:g} fps{head}", *rest])
 
 
 def kept_inside(rig: JawRig, motion: AuthoredMotion) -> tuple[AuthoredMotion, Changes]:

@@ -9,7 +9,7 @@ import re
 import sys
 import time
 import traceback
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, TextIO
 
@@ -22,14 +22,14 @@ if TYPE_CHECKING:
     from rich.progress import TaskID
 
 
-def emit(data: Mapping[str, object], as_json: bool, lines: Callable[[], list[str]]) -> None:
+def emit(data: Mapping[str, object], as_json: bool, lines: Iterable[str]) -> None:
     """Print a result as one JSON object, or as lines of text."""
     if as_json:
         import json
 
         typer.echo(json.dumps(plain(data), indent=1))
     else:
-        for line in lines():
+        for line in lines:
             say(line)
 
 

@@ -109,7 +109,7 @@ def _emit_experiments(found: Experiments, files: list[Path], as_json: bool) -> N
         "notes": list(found.notes),
         "files": files,
     }
-    emit(summary, as_json, lambda: [*experiment_lines(found), *map(str, files)])
+    emit(summary, as_json, [*experiment_lines(found), *map(str, files)])
 
 
 def _report_found(
@@ -132,7 +132,7 @@ def _report_found(
         raise typer.BadParameter(
             "no report is available for a pose file; add --experiments to run the paper's experiments on it."
         )
-    emit({"file": str(path), "bytes": path.stat().st_size}, as_json, lambda: [str(path)])
+    emit({"file": str(path), "bytes": path.stat().st_size}, as_json, [str(path)])
 
 
 PageOption = Annotated[

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -15,16 +16,12 @@ import jawusd
 from jawusd.base.arrays import Array
 from jawusd.base.plugin_path import VARIABLE, schema_folder
 from jawusd.cli.face_commands import (
-    NO,
     AlignOption,
     CsvOption,
     FaceOption,
-    FaceOptions,
     MappingOption,
     StripOption,
-    counted,
-    validate_face,
-    verdict_lines,
+    judge_face,
 )
 from jawusd.cli.motion import read_pose_table
 from jawusd.cli.options import (
@@ -38,10 +35,11 @@ from jawusd.cli.options import (
     changed_in_folder,
     load_named,
 )
-from jawusd.cli.output import emit
+from jawusd.cli.output import emit, refuse_any
 from jawusd.cli.text_build import contact_words, frame_lines, joint_words, track_lines
 from jawusd.evaluator import JawRig, Reason
 from jawusd.evaluator.arrays import HeldOut
+from jawusd.evaluator.verdicts import INSIDE, Verdicts
 from jawusd.formats.finding import Finding as Changed
 from jawusd.formats.poses import read_poses_or_parameters
 from jawusd.formats.tracks import load_tracks
@@ -50,6 +48,8 @@ from jawusd.geometry import LANDMARKS, transform_point, transform_points
 if TYPE_CHECKING:
     from jawusd.rig.read import Description
 
+#: Exit code of a negative result, such as an invalid pose or a rig with errors.
+NO = 1
 Triple = tuple[float, float, float]
 
 
@@ -77,10 +77,10 @@ def info(
         tracks = load_tracks(rig)
         if frame is None:
             take = track_summary(tracks)
-            emit(take, as_json, lambda: track_lines(take))
+            emit(take, as_json, track_lines(take))
         else:
             one = frame_summary(tracks, frame)
-            emit(one, as_json, lambda: frame_lines(one))
+            emit(one, as_json, frame_lines(one))
         return
     if frame is not None:
         raise typer.BadParameter("--frame applies only to tracks (.npz).")
@@ -90,7 +90,7 @@ def info(
     found, changed, verdict = describe(rig, prim), changed_in_folder(context), recorded_verdict(rig.parent)
     whole = {**found, "verdict": verdict, "changed": [finding.as_json() for finding in changed]}
     first = [] if verdict is None else [verdict]
-    emit(whole, as_json, lambda: [*first, *_info_lines(found), *(finding.line() for finding in changed)])
+    emit(whole, as_json, [*first, *_info_lines(found), *(finding.line() for finding in changed)])
 
 
 def _print_schema(as_json: bool) -> None:
@@ -100,7 +100,7 @@ def _print_schema(as_json: bool) -> None:
         f"other programs find it by {VARIABLE}={folder}",
         "`import jawusd` registers it, before the first stage of a process is opened",
     ]
-    emit({"schema": "JawRigAPI", "folder": folder, "variable": VARIABLE}, as_json, lambda: lines)
+    emit({"schema": "JawRigAPI", "folder": folder, "variable": VARIABLE}, as_json, lines)
 
 
 def _info_lines(found: Description) -> list[str]:
@@ -157,20 +157,15 @@ def pose(
     clearance = None if loaded.contact is None else float(loaded.clearance(d).clearance_mm)
     joints = None if loaded.joints is None else float(loaded.clearance(d, of="condyles").clearance_mm)
     landmarks = dict(zip(LANDMARKS, transform_points(T, loaded.landmarks), strict=True))
-
-    def lines() -> list[str]:
-        rows = [" ".join(f"{value:12.6f}" for value in row) for row in T]
-        found = ["T_skull_mandible [mm]", *(f"  {row}" for row in rows)]
-        found.append("twist (omega rad, v mm): " + " ".join(f"{value:.6f}" for value in twist))
-        for name, place in landmarks.items():
-            found.append(f"  {name}: " + " ".join(f"{value:.3f}" for value in place) + " mm")
-        if clearance is not None:
-            collide = Reason.TEETH_COLLIDE in Reason(int(verdict.reason))
-            found.append(f"clearance {clearance:.3f} mm: teeth {'COLLIDE' if collide else 'do not collide'}")
-        if joints is not None:
-            found.append(f"clearance of the condyles {joints:.3f} mm")
-        return [*found, f"margin {margin:.3f} mm: {'inside' if inside else 'OUTSIDE'} the bound"]
-
+    lines = ["T_skull_mandible [mm]", *("  " + " ".join(f"{value:12.6f}" for value in row) for row in T)]
+    lines.append("twist (omega rad, v mm): " + " ".join(f"{value:.6f}" for value in twist))
+    lines += [f"  {name}: " + " ".join(f"{value:.3f}" for value in place) + " mm" for name, place in landmarks.items()]
+    if clearance is not None:
+        collide = Reason.TEETH_COLLIDE in Reason(int(verdict.reason))
+        lines.append(f"clearance {clearance:.3f} mm: teeth {'COLLIDE' if collide else 'do not collide'}")
+    if joints is not None:
+        lines.append(f"clearance of the condyles {joints:.3f} mm")
+    lines.append(f"margin {margin:.3f} mm: {'inside' if inside else 'OUTSIDE'} the bound")
     result = {"T_skull_mandible": T, "twist": twist, "landmarks_mm": landmarks, "margin_mm": margin, "valid": valid}
     emit({"d": list(d), **result, "clearance_mm": clearance, "condyle_clearance_mm": joints}, as_json, lines)
 
@@ -213,9 +208,19 @@ def validate(
     if face is not None:
         if poses is not None:
             raise typer.BadParameter("give either poses or --face.", param_hint="--face")
-        validate_face(
-            rig, face, FaceOptions(align, mapping, csv, strip, force, residual_mm, tolerance_mm), prim, as_json
-        )
+        refuse_any(force, csv, strip)
+        judged = judge_face(jawusd.load(rig, prim=prim), face, align, mapping, residual_mm, tolerance_mm)
+        if csv is not None:
+            from jawusd.fitting.face_judging import save_verdicts
+
+            save_verdicts(csv, judged)
+        if strip is not None:
+            from jawusd.report.figures import save_strip
+
+            save_strip(strip, judged.frames, judged.verdicts)
+        own_mm, widened_mm = judged.verdicts.tolerance_mm, judged.widened_mm
+        limits = f"tolerance {own_mm:.2f} mm, of which {widened_mm:.2f} mm for the alignment"
+        _emit_verdicts("frames", judged.frames, judged.verdicts, limits, {"widened_mm": widened_mm}, as_json)
         return
     if align or mapping or csv or strip:
         raise typer.BadParameter("is needed for --align, --mapping, --csv and --strip.", param_hint="--face")
@@ -224,28 +229,51 @@ def validate(
         return
 
     loaded = load_named(rig, prim, poses)
-    unbaked = _unbaked(loaded, poses, prim)
+    more, stale = _unbaked(loaded, poses, prim)
     frames, T = _poses_or_parameters(loaded, poses, prim)
     verdicts = loaded.validate(T, residual_limit_mm=residual_mm, tolerance_mm=tolerance_mm)
-    rows, counts, words = counted(frames, verdicts)
-    stale = {"unbaked": unbaked["figures"]} if unbaked else {}
-    result = {"poses": len(rows), **counts, **stale, "verdicts": rows}
-    summary = f"{len(rows)} poses: {words} (tolerance of measured poses {verdicts.tolerance_mm:.2f} mm)"
-    emit(result, as_json, lambda: [*verdict_lines(rows), *unbaked.get("lines", []), summary])
-    if counts["invalid"] or unbaked:
+    limits = f"tolerance of measured poses {verdicts.tolerance_mm:.2f} mm"
+    _emit_verdicts("poses", frames, verdicts, limits, more, as_json, stale)
+
+
+def _emit_verdicts(
+    noun: str,
+    frames: Array | NDArray[np.int64],
+    verdicts: Verdicts,
+    limits: str,
+    more: Mapping[str, object],
+    as_json: bool,
+    warnings: Sequence[str] = (),
+) -> None:
+    """Print verdicts on frames (F,), and their counts; exit code 1 if a pose is invalid, or if there are warnings.
+
+    `limits` are the limits in words, `more` are further values for JSON.
+    """
+    figures = (frames, verdicts.valid, verdicts.words(), verdicts.residual_mm, verdicts.margin_mm)
+    rows: list[dict[str, object]] = [
+        {"frame": int(frame), "valid": bool(ok), "reason": words, "residual_mm": float(res), "margin_mm": float(margin)}
+        for frame, ok, words, res, margin in zip(*figures, strict=True)
+    ]
+    inside, valid = int((verdicts.valid & verdicts.inside()).sum()), int(verdicts.valid.sum())
+    within, invalid = valid - inside, len(rows) - valid
+    counts = {"inside": inside, "within_tolerance": within, "invalid": invalid, "tolerance_mm": verdicts.tolerance_mm}
+    shown = "frame {frame}: {reason} (residual {residual_mm:.2f} mm, margin {margin_mm:.2f} mm)"
+    lines = [shown.format(**row) for row in rows if row["reason"] != INSIDE]
+    summary = f"{len(rows)} {noun}: {inside} inside, {within} within tolerance, {invalid} invalid ({limits})"
+    emit({noun: len(rows), **counts, **more, "verdicts": rows}, as_json, [*lines, *warnings, summary])
+    if invalid or warnings:
         raise typer.Exit(NO)
 
 
-def _unbaked(rig: JawRig, path: Path, prim: str | None) -> dict[str, list[str] | dict[str, float]]:
-    """Return a message if the mandible's transform in a stage deviates from its d; empty if both agree."""
+def _unbaked(rig: JawRig, path: Path, prim: str | None) -> tuple[dict[str, object], list[str]]:
+    """Return figures and a warning if the mandible's transform in a stage deviates from its d; empty if both agree."""
     from jawusd.rig.rebake import deviation
 
     away = deviation(path, rig, prim) if path.suffix.lower() in USD_SUFFIXES else None
     if away is None or not away.frames:
-        return {}
+        return {}, []
     message = f"the mandible deviates from d in {away.frames} of {away.of} frames and keys, by up to "
-    message += f"{away.largest_mm:.2f} mm: run `jawusd rebake`"
-    return {"lines": [message], "figures": away._asdict()}
+    return {"unbaked": away._asdict()}, [f"{message}{away.largest_mm:.2f} mm: run `jawusd rebake`"]
 
 
 def _poses_or_parameters(rig: JawRig, path: Path, prim: str | None) -> tuple[NDArray[np.int64], Array]:
@@ -274,14 +302,8 @@ def _validate_rig(path: Path, changed: list[Changed], as_json: bool) -> None:
         findings += nvidia_findings(path, nvidia)
     errors = [finding for finding in findings if finding.severity == "error"]
     result = {"file": str(path), "errors": len(errors), "findings": [asdict(finding) for finding in findings]}
-    emit(
-        result,
-        as_json,
-        lambda: [
-            *(f"{finding.severity}: {finding.rule}: {finding.path}: {finding.message}" for finding in findings),
-            f"{path}: {len(errors)} errors, {len(findings) - len(errors)} other findings",
-        ],
-    )
+    lines = [f"{finding.severity}: {finding.rule}: {finding.path}: {finding.message}" for finding in findings]
+    emit(result, as_json, [*lines, f"{path}: {len(errors)} errors, {len(findings) - len(errors)} other findings"])
     if errors:
         raise typer.Exit(NO)
 
@@ -303,4 +325,4 @@ def ik(
     distance_mm = float(distance)
     reached = transform_point(loaded.pose(d), point)
     result = {"d": d, "reached": reached, "distance_mm": distance_mm, "margin_mm": float(loaded.margin(d))}
-    emit(result, as_json, lambda: [f"d {d[0]:.3f} {d[1]:.3f} {d[2]:.3f} mm, {distance_mm:.3f} mm from the target"])
+    emit(result, as_json, [f"d {d[0]:.3f} {d[1]:.3f} {d[2]:.3f} mm, {distance_mm:.3f} mm from the target"])

@@ -133,7 +133,7 @@ def solve(
         )
     summary = stage.solve_summary(found)
     files = [str(path) for path in written]
-    emit({**summary, "file": str(out), "files": files}, as_json, lambda: [*files, *solve_lines(summary)])
+    emit({**summary, "file": str(out), "files": files}, as_json, [*files, *solve_lines(summary)])
 
 
 def _skin_options(

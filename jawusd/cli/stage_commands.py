@@ -81,7 +81,7 @@ def encode(
     if residual.size:
         head += f", {residual.mean():.3f} mm from the model on average, {residual.max():.3f} mm at most"
     still = still_lines(judged["moved_mm"], len(d)) if holds_stage(poses) else []
-    emit(result, as_json, lambda: [head, *judged_lines(judged)[1:], *still])
+    emit(result, as_json, [head, *judged_lines(judged)[1:], *still])
 
 
 _STILL_MM = 0.01  # displacement below which a jaw counts as still: ten times the rounding error of single precision
@@ -227,7 +227,7 @@ def rebake(
     stronger = _write_baked(out, rig, shot, taken, root, prim[0] if prim else None)
     actors = [{"prim": one.found.prim, "from": one.found.origin, **one.judged, **one.changes.figures} for one in taken]
     result = {"file": str(out), **(actors[0] if len(actors) == 1 else {}), "actors": actors, "stronger": stronger}
-    emit(result, as_json, lambda: _baked_lines(out, shot, taken, stronger))
+    emit(result, as_json, _baked_lines(out, shot, taken, stronger))
 
 
 @dataclass(frozen=True)

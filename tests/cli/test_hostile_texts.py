@@ -46,7 +46,7 @@ def is_harmless(printed, lines=1):
 @every_text
 def test_lines_errors_and_findings_are_harmless(text, capsys, tmp_path):
     say(text)
-    emit({}, False, lambda: [text])
+    emit({}, False, [text])
     said = capsys.readouterr().out
     assert is_harmless(said, 2) and said.startswith("An")
     complain(FormatError(f'holds "{text}".', path=tmp_path / text, camera=text, hint=text))
