@@ -226,9 +226,9 @@ class CapturePage:
         """Pick the vertex or pixel under the pointer, or paint the scan there."""
         if not self.picks.picking.value and not self.labels.painting.value:
             return
-        hits = []
+        ray, hits = (event.ray_origin, event.ray_direction), []
         for arch, T in self.poses.items():
-            hit = hit_vertex(self._capture.scans[arch], T, event.ray_origin, event.ray_direction)
+            hit = hit_vertex(self._capture.scans[arch], T, *ray)
             if hit is not None:
                 hits.append((hit[1], arch, hit[0]))
         if self.labels.painting.value:
@@ -236,10 +236,9 @@ class CapturePage:
                 self.labels.click(*min(hits)[1:])
             return
         if hits:
-            _, arch, vertex = min(hits)
-            self.picks.book.add(arch, vertex)
+            self.picks.book.add(*min(hits)[1:])
         elif self.footage.view in self._capture.sizes_px and self.layout is not None:
-            pixel = self.layout.pixel(event.ray_origin, event.ray_direction)
+            pixel = self.layout.pixel(*ray)
             if pixel is None:
                 return
             self.picks.book.see(self.footage.view, self.footage.frame, pixel)

@@ -7,10 +7,9 @@ from collections.abc import Callable
 
 import viser
 
-from jawusd.formats.tracks import Tracks
 from jawusd.viewer.motion import Player
 from jawusd.viewer.picking import SIDES, PickBook
-from jawusd.viewer.plots import Plot, coverage_plot, frame_html, frames_to_inspect, plot_seek, solve_plot, with_playhead
+from jawusd.viewer.plots import coverage_plot, frame_html, frames_to_inspect, plot_seek, solve_plot
 from jawusd.viewer.viewed import Look, ViewedCapture
 from jawusd.viewer.widgets import Choice, add_dark_checkbox, assign, enable, guarded, notify, small_text
 
@@ -58,7 +57,12 @@ class FootagePanel:
         self._look = gui.add_dropdown("draw", tuple(_LOOKS))
         self._look.on_update(guarded(client, lambda _: changed()))
         if capture.tracks is not None:
-            self._plot = self._draw_plot(capture.tracks)
+            solved = capture.tracks.solved
+            self._plot = (
+                coverage_plot(capture.tracks, capture.frames, self.worst)
+                if solved is None
+                else solve_plot(capture.tracks, solved, capture.frames)
+            )
             gui.add_html(self._plot.definition())
         self._playhead = gui.add_html("")
         first, last = capture.frames
@@ -91,11 +95,6 @@ class FootagePanel:
         """Return the options for drawing the scans into the images."""
         return _LOOKS[self._look.value]
 
-    def _draw_plot(self, tracks: Tracks) -> Plot:
-        if tracks.solved is not None:
-            return solve_plot(tracks, tracks.solved, self._capture.frames)
-        return coverage_plot(tracks, self._capture.frames, self.worst)
-
     def go_to(self, frame: int) -> None:
         """Stop playback and show a frame."""
         self.player.stop()
@@ -126,8 +125,7 @@ class FootagePanel:
         if self.view in capture.offsets and (own := frame - capture.offsets[self.view]) != frame:
             lines[0] += f" (frame {own} of this camera)"
         if capture.tracks is not None:
-            drawn = with_playhead(self._plot, frame)
-            self._playhead.content = plot_seek(drawn, capture.frames, self._plot.across, self.slider._impl.uuid)
+            self._playhead.content = plot_seek(self._plot, frame, self.slider._impl.uuid)
             lines.append(frame_html(capture.tracks, frame))
         else:
             lines.append("no poses; pass the folder of a build or the file of a solve with --tracks")

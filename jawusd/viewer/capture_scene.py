@@ -12,7 +12,7 @@ from jawusd.base.arrays import Array, Mask
 from jawusd.geometry import wxyz_from_matrix
 from jawusd.geometry.se3 import se3_inverse
 from jawusd.viewer.picking import ARCHES, FOV_RAD, PickBook, PickingLayout
-from jawusd.viewer.scene import add_lights
+from jawusd.viewer.scene import add_lights, set_pose
 from jawusd.viewer.viewed import ViewedCapture, for_view
 
 ENAMEL, GUM, BASE = (236, 229, 212), (196, 112, 108), (120, 135, 165)
@@ -40,7 +40,7 @@ class CaptureScene:
 
     def __init__(self, client: viser.ClientHandle, capture: ViewedCapture) -> None:
         self._client, self._scene, self._capture = client, client.scene, capture
-        scene = self._scene
+        scene = client.scene
         self.T_page_world = next((camera.T_cam_world for camera in capture.cameras.values()), np.eye(4))
         self._layout = scene.add_frame("/layout", show_axes=False)
         self._picture: viser.ImageHandle | None = None
@@ -119,11 +119,10 @@ class CaptureScene:
         with self._client.atomic():
             self._layout.visible, self._space.visible = not in_space, in_space
             for arch, frame in self._arches.items():
-                T = poses.get(arch)
-                shown = T is not None and bool(np.isfinite(T).all())
-                if T is not None and shown:
-                    frame.position, frame.wxyz = tuple(T[:3, 3]), tuple(wxyz_from_matrix(T[:3, :3]))
-                frame.visible = shown
+                T = poses.get(arch, np.full((4, 4), np.nan))
+                frame.visible = bool(np.isfinite(T).all())
+                if frame.visible:
+                    set_pose(frame, T)
 
     def show_marks(self, book: PickBook, camera: str | None, frame: int, layout: PickingLayout | None) -> None:
         """Mark the picks on the scans and, in the image of a camera, the picks of this frame."""

@@ -16,7 +16,7 @@ from jawusd.base.errors import FormatError
 from jawusd.formats.keys import load_keys, save_keys
 from jawusd.formats.poses import read_parameters, write_parameters
 from jawusd.viewer.motion import Clip, KeyTrack, Player, with_key, without_key
-from jawusd.viewer.plots import Plot, curve_plot, plot_seek, with_playhead
+from jawusd.viewer.plots import Plot, curve_plot, plot_seek
 from jawusd.viewer.session import Interpolation, Session
 from jawusd.viewer.viewed import ViewedActor
 from jawusd.viewer.widgets import Choice, assign, errors_shown, guarded, limit_uploads, notify, small_text, upload_name
@@ -119,9 +119,7 @@ class MotionPanel:
             self._set_thumbs()
             assign(self.between, work.interpolation)
             assign(self.fps, work.fps)
-        plot, ends = self._plot, (self._plot.low[0], self._plot.high[0])
-        svg = with_playhead(plot, self.frame)
-        self._playhead.content = plot_seek(svg, ends, plot.across, self.frame_slider._impl.uuid)
+        self._playhead.content = plot_seek(self._plot, self.frame, self.frame_slider._impl.uuid)
         assign(self.frame_slider, float(round(self.frame)))
         self._playback.show(*self._where())
 

@@ -157,7 +157,12 @@ class Page:
             if "mandible" in actor.placeholders:
                 gui.add_html(_PLACEHOLDER)
             self.pose = PosePanel(client, self.session, self.scene, self._posed)
-            self.contacts = self._add_contacts(actor)
+            with gui.add_folder("Contacts of the teeth"):
+                self.contacts = None
+                if actor.contacts is None:
+                    gui.add_html(_NO_CONTACTS)
+                else:
+                    self.contacts = ContactPanel(client, actor.rig, actor.contacts, self.refresh)
         with tabs.add_tab("Animate"):
             self.motion = MotionPanel(client, self.session, actor, self.playback, self.refresh)
         with tabs.add_tab("Files"):
@@ -174,13 +179,6 @@ class Page:
     def play_take(self) -> None:
         """Start reading the captured take, if there is one, and play it afterwards."""
         self._opening = asyncio.get_running_loop().create_task(self.motion.play_take())
-
-    def _add_contacts(self, actor: ViewedActor) -> ContactPanel | None:
-        with self.client.gui.add_folder("Contacts of the teeth"):
-            if actor.contacts is None:
-                self.client.gui.add_html(_NO_CONTACTS)
-                return None
-            return ContactPanel(self.client, actor.rig, actor.contacts, self.refresh)
 
     def _posed(self) -> None:
         """Pause playback, which would overwrite the pose, and update everything."""

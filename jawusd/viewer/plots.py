@@ -7,11 +7,10 @@ inherits the page's colour, so that it is legible on light and dark pages.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import ClassVar
 
 import numpy as np
 
-from jawusd.base.arrays import Array
+from jawusd.base.arrays import Array, Indices
 from jawusd.evaluator import JawRig
 from jawusd.evaluator.verdicts import place as place_of
 from jawusd.formats.performance import STATE_COLOURS, STATE_WORDS, SolvedJaw, SolveState
@@ -25,6 +24,8 @@ CURVE_COLORS = (BLUE, VERMILION, GREEN)
 
 _WIDTH, _HEIGHT = 300, 192
 _LEFT, _RIGHT, _TOP, _BOTTOM = 36, 12, 22, 32
+#: Start and end of the plotted area, as fractions of a plot's width.
+ACROSS = (_LEFT / _WIDTH, 1 - _RIGHT / _WIDTH)
 _MOST_POINTS = 300
 _MOST_SAMPLES = 400
 _TEXT = 'font-family="sans-serif" font-size="11" fill="currentColor"'
@@ -35,14 +36,13 @@ class Plot:
     """A plot whose static part, the SVG of axes, outlines and points, has been drawn.
 
     `name` is the id of the static part in the page, `low` and `high` are the corners of the plotted area in data
-    coordinates, and `across` its start and end as fractions of the plot's width.
+    coordinates.
     """
 
     name: str
     static: str
     low: tuple[float, float]
     high: tuple[float, float]
-    across: ClassVar[tuple[float, float]] = (_LEFT / _WIDTH, 1 - _RIGHT / _WIDTH)
 
     def definition(self) -> str:
         """Return hidden HTML that defines the static part; every page needs it once."""
@@ -51,7 +51,7 @@ class Plot:
 
     def with_point(self, x: float, y: float, inside: bool) -> str:
         """Return the SVG of the plot with the current pose marked."""
-        px, py = place(self, np.array([[x, y]]))[0]
+        px, py = _at(self, x, y)
         mark = f'<circle cx="{px:.1f}" cy="{py:.1f}" r="5" fill="{GREEN if inside else VERMILION}" stroke="white"/>'
         return _svg(f'<use href="#{self.name}"/>{mark}')
 
@@ -108,7 +108,7 @@ def curve_plot(clip: Clip | None, keys: KeyTrack, span: tuple[float, float]) -> 
         parts.append(_line(plot, frames, values[:, axis], color))
         parts.append(_label(_WIDTH - 70 + 24 * axis, 11, f"d{axis + 1}", color))
         for key in keys:
-            px, py = place(plot, np.array([[key.frame, key.d[axis]]]))[0]
+            px, py = _at(plot, key.frame, key.d[axis])
             parts.append(f'<circle cx="{px:.1f}" cy="{py:.1f}" r="3" fill="{color}"/>')
     return drawn(plot, parts)
 
@@ -116,29 +116,28 @@ def curve_plot(clip: Clip | None, keys: KeyTrack, span: tuple[float, float]) -> 
 def with_playhead(plot: Plot, frame: float) -> str:
     """Return the SVG of a curve plot with a line at the current frame."""
     frame = min(max(frame, plot.low[0]), plot.high[0])
-    px = place(plot, np.array([[frame, plot.low[1]]]))[0, 0]
+    px, _ = _at(plot, frame, plot.low[1])
     line = f'<path d="M{px:.1f} {_TOP}V{_HEIGHT - _BOTTOM}" stroke="{ORANGE}" stroke-width="2"/>'
     return _svg(f'<use href="#{plot.name}"/>{line}')
 
 
-def plot_seek(drawn: str, ends: tuple[float, float], across: tuple[float, float], slider: str) -> str:
-    """Return the HTML of a plot in which a click or drag sets a frame slider to the frame under the pointer.
+def plot_seek(plot: Plot, frame: float, slider: str) -> str:
+    """Return the HTML of a curve plot in which a click or drag sets a frame slider to the frame under the pointer.
 
-    viser does not report clicks in a plot, so the page emulates keyboard input to the slider with the given id. `ends`
-    are the first and last frame of the axis, `across` their positions as fractions of the plot's width.
+    viser does not report clicks in a plot, so the page emulates keyboard input to the slider with the given id.
     """
-    low, high = across
+    (low, high), first, last = ACROSS, plot.low[0], plot.high[0]
     share = f"((event.clientX-r.left)/r.width-{low:.5f})/{high - low:.5f}"
     box = f"document.getElementById('{slider}').parentElement.querySelector('input:not([type=hidden])')"
     script = (
         f"if(event.buttons&1){{const b={box},"
         f"r=this.firstElementChild.getBoundingClientRect(),s=Math.min(1,Math.max(0,{share}));"
         "Object.getOwnPropertyDescriptor(HTMLInputElement.prototype,'value').set.call(b,"
-        f"Math.round({ends[0]:g}+s*{ends[1] - ends[0]:g}));"
+        f"Math.round({first:g}+s*{last - first:g}));"
         "b.dispatchEvent(new Event('input',{bubbles:true}))}"
     )
     style = "padding:0 6px;cursor:col-resize;touch-action:none;user-select:none"
-    return f'<div style="{style}" onpointerdown="{script}" onpointermove="{script}">{drawn}</div>'
+    return f'<div style="{style}" onpointerdown="{script}" onpointermove="{script}">{with_playhead(plot, frame)}</div>'
 
 
 def _svg(content: str) -> str:
@@ -158,14 +157,13 @@ def place(plot: Plot, points: Array) -> Array:
     return np.stack([x, y], axis=1)
 
 
+def _at(plot: Plot, x: float, y: float) -> Array:
+    """Return the pixel (2,) of a data point."""
+    return place(plot, np.array([[x, y]]))[0]
+
+
 def framed(
-    name: str,
-    data: Array,
-    title: str,
-    x_label: str,
-    y_label: str,
-    *,
-    pad: tuple[bool, bool] = (True, True),
+    name: str, data: Array, title: str, x_label: str, y_label: str, pad: tuple[bool, bool] = (True, True)
 ) -> Plot:
     """Return a plot with axes, ticks and labels whose range contains data (n, 2), widened along x and y if `pad`."""
     low, high = data.min(axis=0), data.max(axis=0)
@@ -180,10 +178,10 @@ def framed(
         f'<text x="4" y="{_TOP - 8}" {_TEXT}>{y_label}</text>',
     ]
     for tick in _ticks(low[0], high[0]):
-        px = place(plot, np.array([[tick, low[1]]]))[0, 0]
+        px, _ = _at(plot, tick, low[1])
         parts.append(f'<text x="{px:.1f}" y="{_HEIGHT - _BOTTOM + 13}" text-anchor="middle" {_TEXT}>{tick:g}</text>')
     for tick in _ticks(low[1], high[1]):
-        py = place(plot, np.array([[low[0], tick]]))[0, 1]
+        _, py = _at(plot, low[0], tick)
         parts.append(f'<text x="{_LEFT - 4}" y="{py + 4:.1f}" text-anchor="end" {_TEXT}>{tick:g}</text>')
         parts.append(f'<path d="M{_LEFT} {py:.1f}h{area[0]}" stroke="{GREY}" stroke-opacity=".25"/>')
     return drawn(plot, parts)
@@ -207,9 +205,12 @@ def path_through(pixels: Array) -> str:
     return "M" + "L".join(f"{x:.1f} {y:.1f}" for x, y in pixels)
 
 
+def _curve(steps: str, color: str, more: str = "", width: float = 1.5) -> str:
+    return f'<path d="{steps}" fill="none" stroke="{color}" stroke-width="{width}"{more}/>'
+
+
 def _line(plot: Plot, frames: Array, values: Array, color: str) -> str:
-    pixels = place(plot, np.stack([frames, values], axis=1))
-    return f'<path d="{path_through(pixels)}" fill="none" stroke="{color}" stroke-width="1.5"/>'
+    return _curve(path_through(place(plot, np.stack([frames, values], axis=1))), color)
 
 
 def _label(x: float, size: int, name: str, color: str) -> str:
@@ -217,8 +218,7 @@ def _label(x: float, size: int, name: str, color: str) -> str:
 
 
 def _ring(plot: Plot, points: Array, color: str, dash: str = "") -> str:
-    dashed = f' stroke-dasharray="{dash}"' if dash else ""
-    return f'<path d="{path_through(place(plot, points))}Z" fill="none" stroke="{color}" stroke-width="1.5"{dashed}/>'
+    return _curve(f"{path_through(place(plot, points))}Z", color, f' stroke-dasharray="{dash}"' if dash else "")
 
 
 def _dots(plot: Plot, points: Array) -> str:
@@ -282,11 +282,9 @@ def coverage_plot(tracks: Tracks, span: tuple[int, int], worst: list[int]) -> Pl
         ends = place(plot, np.array([[frame, low], [frame, high]]))
         parts.append(f'<path d="{path_through(ends)}" stroke="{VERMILION}" stroke-opacity=".4"/>')
     for k, color in enumerate(_COLORS):
-        known = np.flatnonzero(np.isfinite(percent[:, k]))
-        pieces = np.split(known, np.flatnonzero(np.diff(known) > 1) + 1) if len(known) else []
         curve = np.stack([tracks.frames, percent[:, k]], axis=1)
-        steps = "".join(path_through(place(plot, curve[piece])) for piece in pieces)
-        parts.append(f'<path d="{steps}" fill="none" stroke="{color}" stroke-width="1.2"/>')
+        known = _runs(np.flatnonzero(np.isfinite(percent[:, k])))
+        parts.append(_curve("".join(path_through(place(plot, curve[run])) for run in known), color, width=1.2))
     for x, y in place(plot, np.array([[frame, high] for frame in worst]).reshape(-1, 2)):
         parts.append(f'<path d="M{x:.1f} {y:.1f}l-3 -5h6z" fill="{VERMILION}"/>')
     return drawn(plot, parts)
@@ -319,12 +317,17 @@ def _band(plot: Plot, frames: Array, d: Array, sigma: Array, color: str) -> str:
 
 def _strip(plot: Plot, tracks: Tracks, solved: SolvedJaw, state: SolveState) -> str:
     """Return SVG bars along the axis at the frames with a given state."""
-    rows = np.flatnonzero(solved.state == state)
-    runs = np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1) if len(rows) else []
-    ends = [(float(tracks.frames[run[0]]) - 0.5, float(tracks.frames[run[-1]]) + 0.5) for run in runs]
-    pixels = [place(plot, np.array([[a, plot.low[1]], [b, plot.low[1]]])) for a, b in ends]
-    steps = "".join(f"M{a[0]:.1f} {a[1] - _STRIP_PX / 2:.1f}H{b[0]:.1f}" for a, b in pixels)
+    steps = ""
+    for run in _runs(np.flatnonzero(solved.state == state)):
+        x, y = _at(plot, float(tracks.frames[run[0]]) - 0.5, plot.low[1])
+        end, _ = _at(plot, float(tracks.frames[run[-1]]) + 0.5, plot.low[1])
+        steps += f"M{x:.1f} {y - _STRIP_PX / 2:.1f}H{end:.1f}"
     return f'<path d="{steps}" stroke="{_css(state)}" stroke-width="{_STRIP_PX}"/>'
+
+
+def _runs(rows: Indices) -> list[Indices]:
+    """Split increasing numbers where one is missing."""
+    return np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1) if len(rows) else []
 
 
 def solve_html(tracks: Tracks, solved: SolvedJaw, frame: int) -> str:

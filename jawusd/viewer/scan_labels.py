@@ -26,13 +26,14 @@ _RADIUS_MM = (0.3, 8.0, 0.1, 1.5)  # radius of the brush: minimum, maximum, step
 class ScanBrush:
     """Editable labels of both scans in one page, with undo.
 
-    `labels` has the label of every vertex as in `formats.mesh`, uint8 (V,), by arch; `changed` names unsaved arches.
+    `labels` has the label of every vertex as in `formats.mesh`, uint8 (V,), by arch; `changed` names unsaved arches;
+    `strokes`, which can be undone, have the arch, its vertices, and their labels before.
     """
 
     def __init__(self, scans: Mapping[str, Mesh], labels: Mapping[str, NDArray[np.uint8]]) -> None:
         self._scans = scans
         self.labels = {arch: found.copy() for arch, found in labels.items()}
-        self._strokes: list[tuple[str, Indices, NDArray[np.uint8]]] = []
+        self.strokes: list[tuple[str, Indices, NDArray[np.uint8]]] = []
         self.changed: set[str] = set()
 
     def paint(self, arch: str, vertex: int, radius_mm: float, label: int) -> int:
@@ -40,28 +41,19 @@ class ScanBrush:
         near = surface_near(self._scans[arch], vertex, radius_mm)
         near = near[self.labels[arch][near] != label]
         if len(near):
-            self._strokes.append((arch, near, self.labels[arch][near]))
+            self.strokes.append((arch, near, self.labels[arch][near]))
             self.labels[arch][near] = label
             self.changed.add(arch)
         return len(near)
 
-    @property
-    def strokes(self) -> int:
-        """Return the number of strokes that can be undone."""
-        return len(self._strokes)
-
     def undo(self) -> str | None:
         """Undo the last stroke; return its arch, or None if there is no stroke."""
-        if not self._strokes:
+        if not self.strokes:
             return None
-        arch, where, before = self._strokes.pop()
+        arch, where, before = self.strokes.pop()
         self.labels[arch][where] = before
         self.changed.add(arch)
         return arch
-
-    def saved(self, arch: str) -> None:
-        """Mark the labels of an arch as saved."""
-        self.changed.discard(arch)
 
     def faces_with(self, arch: str, label: int) -> Mask:
         """Return a mask of an arch's faces that have a label at most of their corners, shape (F,)."""
@@ -129,10 +121,10 @@ class ScanLabelsPanel:
     def _show_state(self) -> None:
         enable(self.kinds, self.painting.value)
         enable(self.radius, self.painting.value)
-        enable(self.undo, self.brush.strokes > 0)
+        enable(self.undo, bool(self.brush.strokes))
         name = next(name for name, label in BRUSHES.items() if label == self.label)
         unsaved = " and ".join(sorted(self.brush.changed))
-        state = f"painting {name}; {self.brush.strokes} strokes; "
+        state = f"painting {name}; {len(self.brush.strokes)} strokes; "
         self._state.content = small_text(state + (f"not saved: {unsaved}" if unsaved else "all saved"))
 
     def _turn(self, _: object) -> None:
@@ -154,10 +146,7 @@ class ScanLabelsPanel:
         paths = []
         for arch, labels in self.brush.labels.items():
             paths.append(await asyncio.to_thread(self._capture.save_labels, arch, labels.copy()))
-            self.brush.saved(arch)
+            self.brush.changed.discard(arch)
         self._show_state()
-        notify(
-            self._client,
-            "Written",
-            f"{' and '.join(path.name for path in paths)}; run track or build again to use them",
-        )
+        names = " and ".join(path.name for path in paths)
+        notify(self._client, "Written", f"{names}; run track or build again to use them")

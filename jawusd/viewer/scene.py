@@ -86,6 +86,11 @@ def _add_mesh(scene: viser.SceneApi, name: str, mesh: Mesh, color: Color, opacit
     return scene.add_mesh_simple(name, mesh.vertices, mesh.faces, color=color, opacity=opacity, side=side)
 
 
+def set_pose(frame: viser.FrameHandle, T: Array) -> None:
+    """Set the pose T (4, 4) [mm] of a frame."""
+    frame.position, frame.wxyz = tuple(T[:3, 3]), tuple(wxyz_from_matrix(T[:3, :3]))
+
+
 class JawScene:
     """3-D scene of one page: first only skull and jaw, then `add_marks`; `grips` are the meshes that can be dragged."""
 
@@ -105,21 +110,17 @@ class JawScene:
         """Add the landmarks, the paths, and the hidden marks of pins and of the grabbed point."""
         for name, place in zip(LANDMARKS, actor.rig.landmarks, strict=True):
             if not name.startswith("molar"):
-                self._ball(f"/jaw/{name}", _MARKER_MM, _CONDYLE if name.startswith("condyle") else _INCISOR, place)
+                color = _CONDYLE if name.startswith("condyle") else _INCISOR
+                self._ball(f"/jaw/{name}", _MARKER_MM, color).position = place
         self._paths = self._add_paths(actor)
-        self._pins = {name: self._ball(f"/pin/{name}", _PIN_MM, _PIN, opacity=0.6) for name in LANDMARKS}
+        self._pins = {name: self._ball(f"/pin/{name}", _PIN_MM, _PIN, 0.6) for name in LANDMARKS}
         self._held = self._ball("/held", _MARKER_MM, _HELD)
         self._line = self._lines("/pull", np.zeros((1, 2, 3)), _HELD)
         self.show_grab(None, None)
         self.show_pins({})
 
-    def _ball(
-        self, name: str, radius_mm: float, color: Color, place: Array | None = None, opacity: float | None = None
-    ) -> viser.IcosphereHandle:
-        position = (0.0, 0.0, 0.0) if place is None else place
-        return self._scene.add_icosphere(
-            name, radius=radius_mm, color=color, subdivisions=_BALL, opacity=opacity, position=position
-        )
+    def _ball(self, name: str, radius_mm: float, color: Color, opacity: float | None = None) -> viser.IcosphereHandle:
+        return self._scene.add_icosphere(name, radius=radius_mm, color=color, subdivisions=_BALL, opacity=opacity)
 
     def _lines(self, name: str, ends: Array, color: Color) -> viser.LineSegmentsHandle:
         return self._scene.add_line_segments(name, ends, colors=color, thickness=2.5, thickness_units="screen")
@@ -157,12 +158,9 @@ class JawScene:
         if len(T_skull_mandible) and not self._ghosts:
             self._ghosts = [self._add_ghost(f"/ghost_{k}") for k in range(GHOSTS)]
         for k, ghost in enumerate(self._ghosts):
-            visible = k < len(T_skull_mandible)
-            if visible:
-                T = self._T_world_skull @ T_skull_mandible[k]
-                ghost.position, ghost.wxyz = tuple(T[:3, 3]), tuple(wxyz_from_matrix(T[:3, :3]))
-            if ghost.visible != visible:
-                ghost.visible = visible
+            if k < len(T_skull_mandible):
+                set_pose(ghost, self._T_world_skull @ T_skull_mandible[k])
+            ghost.visible = k < len(T_skull_mandible)
 
     def _add_ghost(self, name: str) -> viser.FrameHandle:
         ghost = self._scene.add_frame(name, show_axes=False)
@@ -173,31 +171,26 @@ class JawScene:
 
     def move(self, T_skull_mandible: Array, inside: bool) -> None:
         """Pose the mandible; colour it if the pose is invalid."""
-        T = self._T_world_skull @ T_skull_mandible
         with self._client.atomic():
-            self._jaw.position = tuple(T[:3, 3])
-            self._jaw.wxyz = tuple(wxyz_from_matrix(T[:3, :3]))
+            set_pose(self._jaw, self._T_world_skull @ T_skull_mandible)
         if inside != self._inside and self._mandible is not None:
             self._mandible.color = self._bone if inside else _OUTSIDE
         self._inside = inside
 
     def show_grab(self, held_skull: Array | None, pointer_skull: Array | None) -> None:
         """Mark the grabbed point and draw a line to the pointer, both (3,) [mm] in the skull frame; None hides them."""
-        visible = held_skull is not None and pointer_skull is not None
         if held_skull is not None and pointer_skull is not None:
             ends = transform_points(self._T_world_skull, np.stack([held_skull, pointer_skull]))
             self._held.position = tuple(ends[0])
             self._line.points = ends[None].astype(np.float32)
-        if self._held.visible != visible:
-            self._held.visible = self._line.visible = visible
+        self._held.visible = self._line.visible = held_skull is not None and pointer_skull is not None
 
     def show_pins(self, places_skull: dict[str, Array]) -> None:
         """Mark the pinned landmarks at their positions (3,) [mm] in the skull frame."""
         for name, ball in self._pins.items():
             if name in places_skull:
                 ball.position = tuple(transform_point(self._T_world_skull, places_skull[name]))
-            if ball.visible != (name in places_skull):
-                ball.visible = name in places_skull
+            ball.visible = name in places_skull
 
     def skull_from_page(self, position: tuple[float, float, float]) -> Array:
         """Transform a position from the page's world to the skull frame [mm], shape (3,)."""
@@ -232,9 +225,9 @@ def preset_view(rest: Array, preset: str, aspect: float = 1.0) -> tuple[Array, A
     return target, target + away
 
 
-def set_first_view(server: viser.ViserServer, rest: Array, preset: str = FIRST_VIEW) -> None:
-    """Start every page lit and with a preset view, given the landmarks (5, 3) at rest [mm]."""
-    target, eye = preset_view(rest, preset)
+def set_first_view(server: viser.ViserServer, rest: Array) -> None:
+    """Start every page lit and with the initial view, given the landmarks (5, 3) at rest [mm]."""
+    target, eye = preset_view(rest, FIRST_VIEW)
     add_lights(server.scene, UP)
     server.scene.set_up_direction("+y")
     first = server.initial_camera

@@ -55,9 +55,8 @@ def add_dark_checkbox(client: viser.ClientHandle) -> None:
 
 
 def assign(widget: viser.GuiInputHandle[Value], value: Value) -> None:
-    """Set the value of a widget if it differs from the current one, to avoid redundant messages to the page."""
-    if widget.value != value:
-        widget.value = value  # type: ignore[misc]  # mypy does not find viser's setter
+    """Set the value of a widget; viser sends it to the page only if it differs."""
+    widget.value = value  # type: ignore[misc]  # mypy does not find viser's setter
 
 
 class _Widget(Protocol):
@@ -68,9 +67,8 @@ class _Widget(Protocol):
 def enable(widget: _Widget, on: bool) -> None:
     """Enable or disable a widget; hide button groups, which viser cannot disable."""
     if isinstance(widget, viser.GuiButtonGroupHandle):
-        if widget.visible != on:
-            widget.visible = on
-    elif widget.disabled == on:
+        widget.visible = on
+    else:
         widget.disabled = not on
 
 

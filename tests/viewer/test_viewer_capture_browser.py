@@ -17,6 +17,7 @@ from jawusd.formats.capture import load_capture
 from jawusd.formats.tracks import load_tracks
 from jawusd.geometry import transform_point, transform_points
 from jawusd.pipeline.view_capture import open_capture_viewer
+from jawusd.viewer.plots import ACROSS
 
 EXAMPLE = ROOT / "examples" / "capture"
 FIRST, STOP = 20, 90
@@ -233,7 +234,7 @@ def test_tracked_poses_are_drawn_and_the_plot_is_a_timeline(chromium, example_bu
     tab.settle()
     footage = tab.page.footage
     plot = tab.resting_place(tab.web.locator("svg:has(use[href='#jaw-coverage'])"))
-    left, right = footage._plot.across
+    left, right = ACROSS
     x = plot["x"] + plot["width"] * (left + 0.5 * (right - left))
     tab.web.mouse.click(x, plot["y"] + 0.5 * plot["height"])
     until(lambda: abs(footage.frame - 170) <= 2)  # halfway from 20 to 319

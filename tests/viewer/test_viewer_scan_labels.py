@@ -46,7 +46,7 @@ def test_strokes_are_taken_back_in_order() -> None:
     assert brush.undo() is None and not brush.changed
     assert brush.paint("upper", 0, 1.0, TOOTH) > 10 and brush.paint("upper", 0, 1.0, TOOTH) == 0
     first = brush.labels["upper"].copy()
-    assert brush.paint("upper", 0, 0.5, BASE) > 0 and brush.strokes == 2 and brush.changed == {"upper"}
+    assert brush.paint("upper", 0, 0.5, BASE) > 0 and len(brush.strokes) == 2 and brush.changed == {"upper"}
     masks = [brush.faces_with("upper", label) for label in (TOOTH, GUM, BASE)]
     assert (np.sum(masks, axis=0) == 1).all() and all(mask.any() for mask in masks)
     assert brush.undo() == "upper"
@@ -75,7 +75,7 @@ def test_painted_labels_are_saved_and_used(tmp_path) -> None:
         assert panel.brush.changed == {"upper"} and "not saved: upper" in panel._state.content
         assert not page.page.picks.book.picks or page.page.picks.book.bootstrap() == viewed.picks
         page.enter(panel.undo, True)
-        assert panel.brush.strokes == 0
+        assert not panel.brush.strokes
         page.click(transform_point(page.page.poses["upper"], vertices[front]))
         page.enter(panel.write, True)
         assert page.notices.pop()[0] == "Written" and "all saved" in panel._state.content
