@@ -19,7 +19,7 @@ from jawusd.formats.tracks import LOST, LostReason
 from jawusd.report.figures import human_ranges, model_figure, tracking_figure
 from jawusd.report.replay import replay_data
 from jawusd.report.style import inline_svg
-from jawusd.report.templates import base64_text, package_file, page_environment
+from jawusd.report.templates import rendered
 from jawusd.report.verdicts import MARKS, WORDS, judge, summary
 
 _LISTED = 60  # maximum number of frame ranges in a list
@@ -44,32 +44,26 @@ def document(data: ReportData, figures: Mapping[str, Markup] | None = None) -> s
     """Return the report as HTML, with text from files escaped; see `write_document`."""
     verdicts = judge(data)
     verdict = summary(verdicts)
-    return (
-        page_environment()
-        .get_template("report.html.j2")
-        .render(
-            data=data,
-            verdicts=verdicts,
-            verdict=verdict,
-            sentence=verdict_sentence(verdict),
-            words=WORDS,
-            marks=MARKS,
-            style=package_file("report.css"),
-            script=package_file("scene.js") + package_file("timeline.js") + package_file("replay.js"),
-            replay=replay_data(data),
-            figures=draw_figures(data) if figures is None else figures,
-            pictures=[(one, base64_text(one.jpeg)) for one in data.overlays],
-            contacts=[(one, base64_text(one.jpeg)) for one in data.contacts],
-            paper=(DEEP, *TOUCHING),
-            ranges=human_ranges(data.tracks, data.model),
-            errors=_error_tables(data),
-            frames=_frame_lists(data),
-            uncertainty=data.model.meta.get("uncertainty", {}),
-            start=_start(data),
-            cameras=_cameras(data),
-            findings=_findings(data),
-            bite=_bite(data),
-        )
+    return rendered(
+        "report.html.j2",
+        ("scene.js", "timeline.js", "replay.js"),
+        data=data,
+        verdicts=verdicts,
+        verdict=verdict,
+        sentence=verdict_sentence(verdict),
+        words=WORDS,
+        marks=MARKS,
+        replay=replay_data(data),
+        figures=draw_figures(data) if figures is None else figures,
+        paper=(DEEP, *TOUCHING),
+        ranges=human_ranges(data.tracks, data.model),
+        errors=_error_tables(data),
+        frames=_frame_lists(data),
+        uncertainty=data.model.meta.get("uncertainty", {}),
+        start=_start(data),
+        cameras=_cameras(data),
+        findings=_findings(data),
+        bite=_bite(data),
     )
 
 

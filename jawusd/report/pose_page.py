@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from markupsafe import Markup
 from numpy.typing import NDArray
 
 from jawusd.base.arrays import Array
@@ -21,7 +20,7 @@ from jawusd.formats.mesh import DEEP, TOUCHING
 from jawusd.formats.report import ReplayPart
 from jawusd.geometry.se3 import se3_log, transform_points
 from jawusd.report.replay import TRACED, encoded, framed, packed
-from jawusd.report.templates import base64_text, package_file, page_environment
+from jawusd.report.templates import base64_text, rendered
 
 if TYPE_CHECKING:
     from jawusd.meshes.contact import Teeth
@@ -115,17 +114,7 @@ def write_pose_page(path: str | os.PathLike[str], page: PosePage) -> None:
     Raises:
         OutputError: the file cannot be written.
     """
-    text = (
-        page_environment()
-        .get_template("pose.html.j2")
-        .render(
-            name=page.name,
-            style=package_file("report.css"),
-            script=Markup().join(map(package_file, _SCRIPTS)),
-            data=pose_data(page),
-            marks=(*TOUCHING, DEEP),
-        )
-    )
+    text = rendered("pose.html.j2", _SCRIPTS, name=page.name, data=pose_data(page), marks=(*TOUCHING, DEEP))
     write_text_atomic(path, text)
 
 

@@ -21,7 +21,7 @@ from jawusd.formats.report import SolveReportData
 from jawusd.formats.tracks import LOST, Tracks
 from jawusd.report.figures import legend_beside, name_lanes, runs, thinned
 from jawusd.report.style import BLACK, BLUE, GREEN, GREY, MAGENTA, ORANGE, SKY, VERMILION, inline_svg, new_figure
-from jawusd.report.templates import base64_text, package_file, page_environment
+from jawusd.report.templates import rendered
 
 #: Colours of the solve states: close to those of the outlines in the images, but legible on light and dark pages.
 STATE_INKS = {SolveState.SOLVED: GREEN, SolveState.SKIN: SKY, SolveState.CARRIED: ORANGE, SolveState.LOST: MAGENTA}
@@ -132,22 +132,17 @@ def solve_page(data: SolveReportData) -> str:
         raise FormatError("has no solved performance.", hint="Pass the .npz written by `jawusd solve`.")
     findings = list(dict.fromkeys(Finding.from_json(one).line() for one in data.tracks.meta.get("findings", [])))
     unobserved = unobserved_runs(data, solved)
-    return (
-        page_environment()
-        .get_template("solve.html.j2")
-        .render(
-            data=data,
-            style=package_file("report.css"),
-            counts=_counts(solved),
-            sentence=_sentence(solved, bool(findings)),
-            jaw=_jaw_rows(solved),
-            figures=_figures(data, solved),
-            pictures=[(one, base64_text(one.jpeg)) for one in data.overlays],
-            unobserved=unobserved[:_LISTED],
-            more=max(len(unobserved) - _LISTED, 0),
-            cameras=_cameras(data),
-            findings=findings,
-        )
+    return rendered(
+        "solve.html.j2",
+        data=data,
+        counts=_counts(solved),
+        sentence=_sentence(solved, bool(findings)),
+        jaw=_jaw_rows(solved),
+        figures=_figures(data, solved),
+        unobserved=unobserved[:_LISTED],
+        more=max(len(unobserved) - _LISTED, 0),
+        cameras=_cameras(data),
+        findings=findings,
     )
 
 
@@ -181,20 +176,14 @@ def _figures(data: SolveReportData, solved: SolvedJaw) -> dict[str, Markup]:
 
 def _counts(solved: SolvedJaw) -> list[tuple[str, int, str, str]]:
     """Return (name, frames, percentage, meaning) of every state and verdict."""
+    interpolated = "the pose is interpolated from neighbouring frames"
+    tolerated = "the pose lies outside the rig's bound, but within the tolerance of measured poses"
     rows = (
         ("solved", solved.state == SolveState.SOLVED, "both arches were found in the masks"),
         ("skin", solved.state == SolveState.SKIN, "an arch was not found; d is estimated from facial skin"),
         ("carried", solved.state == SolveState.CARRIED, "an arch was hidden; its pose is interpolated"),
-        (
-            "lost",
-            solved.state == SolveState.LOST,
-            "the masks match no pose; the pose is interpolated from neighbouring frames",
-        ),
-        (
-            "within tolerance",
-            solved.valid & ~is_inside(solved.margin_mm),
-            "the pose lies outside the rig's bound, but within the tolerance of measured poses",
-        ),
+        ("lost", solved.state == SolveState.LOST, f"the masks match no pose; {interpolated}"),
+        ("within tolerance", solved.valid & ~is_inside(solved.margin_mm), tolerated),
         ("outside", ~solved.valid, "the pose is invalid for the rig"),
     )
     total = max(len(solved.state), 1)
@@ -203,22 +192,18 @@ def _counts(solved: SolvedJaw) -> list[tuple[str, int, str, str]]:
 
 def _sentence(solved: SolvedJaw, has_findings: bool) -> str:
     """Return a sentence on what to inspect, based only on the verdicts in the tracks."""
-    said = []
-    if (solved.state == SolveState.LOST).any():
-        said.append("some frames are lost: inspect their masks")
-    if (solved.state == SolveState.SKIN).any():
-        said.append("some frames are estimated from facial skin: see their sigma for the expected error")
-    if (solved.state == SolveState.CARRIED).any():
-        said.append("some frames are interpolated from their neighbours: see their sigma for the expected error")
-    if not solved.valid.all():
-        said.append(
-            "some poses lie outside the rig's bound: the masks are wrong, or the subject exceeded the captured range"
-        )
-    if has_findings:
-        said.append("there are findings")
-    if not said:
+    outside = "some poses lie outside the rig's bound: the masks are wrong, or the subject exceeded the captured range"
+    error, states = "see their sigma for the expected error", set(solved.state.tolist())
+    said = (
+        (SolveState.LOST in states, "some frames are lost: inspect their masks"),
+        (SolveState.SKIN in states, f"some frames are estimated from facial skin: {error}"),
+        (SolveState.CARRIED in states, f"some frames are interpolated from their neighbours: {error}"),
+        (not solved.valid.all(), outside),
+        (has_findings, "there are findings"),
+    )
+    text = "; ".join(words for holds, words in said if holds)
+    if not text:
         return "Both arches were found in every frame, and every pose is valid for the rig."
-    text = "; ".join(said)
     return f"{text[0].upper()}{text[1:]}."
 
 

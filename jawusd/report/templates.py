@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import math
 import re
+from collections.abc import Iterable
 from importlib import resources
 
 import jinja2
@@ -13,8 +14,8 @@ from markupsafe import Markup, escape
 from jawusd.base.errors import shown
 
 
-def page_environment() -> jinja2.Environment:
-    """Return the Jinja environment of the page templates; it escapes text from files."""
+def rendered(template: str, scripts: Iterable[str] = (), **values: object) -> str:
+    """Return a page of this package as HTML, with style sheet and scripts; text from files is escaped."""
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("jawusd.report", "page"),
         autoescape=True,
@@ -24,8 +25,9 @@ def page_environment() -> jinja2.Environment:
         # HTML from this package is of type Markup
         finalize=lambda value: shown(value) if type(value) is str else value,
     )
-    environment.filters |= {"worded": worded, "figure": figure}
-    return environment
+    environment.filters |= {"worded": worded, "figure": figure, "base64": base64_text}
+    values |= {"style": package_file("report.css"), "script": Markup().join(map(package_file, scripts))}
+    return environment.get_template(template).render(values)
 
 
 def worded(text: str) -> Markup:
