@@ -10,6 +10,7 @@ import typer
 
 import jawusd
 from jawusd.base.errors import FormatError
+from jawusd.cli import options
 from jawusd.cli.motion import (
     AuthoredMotion,
     carried_over,
@@ -20,7 +21,6 @@ from jawusd.cli.motion import (
     read_motion,
     resampled,
 )
-from jawusd.cli.options import USD_SUFFIXES, Allow, Force, Json, Prim, RigArg, rig_of_folder
 from jawusd.cli.output import emit, refuse_any
 from jawusd.cli.stage_commands import holds_stage, moved_mm, read_stage_motion, still_lines
 from jawusd.evaluator import JawRig
@@ -39,7 +39,7 @@ RetargetFrom = Annotated[
     Path | None,
     typer.Option(
         help="Rig for which the source was made; the source may then also be an animation layer.",
-        callback=rig_of_folder,
+        callback=options.rig_of_folder,
     ),
 ]
 
@@ -47,7 +47,7 @@ RetargetFrom = Annotated[
 def _source_motion(loaded: JawRig, rig: Path, source: Path, prim: str | None) -> AuthoredMotion:
     if not holds_stage(source):
         return read_motion(loaded, source)
-    own = None if source.suffix.lower() in USD_SUFFIXES else prim  # the rig's prim path in the stage may differ
+    own = None if source.suffix.lower() in options.USD_SUFFIXES else prim  # the rig's prim path in the stage may differ
     found = read_stage_motion(loaded, rig, source, own, None, None, None)
     return AuthoredMotion(found.frames, found.d, found.fps)
 
@@ -105,7 +105,7 @@ def _write(
 
 
 def animate(
-    rig: RigArg,
+    rig: options.RigArg,
     source: Annotated[
         Path | None, typer.Argument(help="keys.json, a CSV of d or of poses, a stage, .fbx or .glb.")
     ] = None,
@@ -127,10 +127,10 @@ def animate(
         typer.Option("--resample", min=0.001, help="Frames per second of the layer, if different from the source."),
     ] = None,
     splines: Annotated[Path | None, typer.Option(help="Also write the keys as USD splines, to this layer.")] = None,
-    force: Force = False,
-    prim: Prim = None,
-    allow: Allow = None,
-    as_json: Json = False,
+    force: options.Force = False,
+    prim: options.Prim = None,
+    allow: options.Allow = None,
+    as_json: options.Json = False,
 ) -> None:
     """Write an animation layer over a rig, or meshes and motion as .glb; frames clamped to the bound are reported."""
     from jawusd.rig import describe
@@ -161,15 +161,15 @@ _CLAMPED_MM = 0.005  # minimum distance for a frame to be listed; smaller distan
 
 
 def arkit_table(
-    rig: RigArg,
+    rig: options.RigArg,
     out: Annotated[Path, typer.Option("-o", "--out", help="Table to write (CSV).")] = Path("joint.csv"),
     mapping: Annotated[
         Path | None, typer.Option(help="The actor's map, written by arkit-fit. Default: fractions of the ranges.")
     ] = None,
-    force: Force = False,
-    prim: Prim = None,
-    allow: Allow = None,
-    as_json: Json = False,
+    force: options.Force = False,
+    prim: options.Prim = None,
+    allow: options.Allow = None,
+    as_json: options.Json = False,
 ) -> None:
     """Write the jaw joint's offset for each ARKit shape at half and full weight, for rigs that sum joint deltas.
 
@@ -197,7 +197,7 @@ def rate_of(rig: Path, prim: str | None) -> float:
     """
     from jawusd.rig import describe
 
-    if rig.suffix.lower() not in USD_SUFFIXES:
+    if rig.suffix.lower() not in options.USD_SUFFIXES:
         raise typer.BadParameter(
             "is needed: neither the jaw motion nor the rig states a frame rate.", param_hint="--jaw-fps"
         )

@@ -12,29 +12,8 @@ import typer
 
 from jawusd.base.errors import explain_missing_packages, naming_file
 from jawusd.base.guard import map_large_arrays
+from jawusd.cli import options
 from jawusd.cli.commands import command_line, stopped_by_signals
-from jawusd.cli.options import (
-    CaptureArg,
-    CaptureOption,
-    ColumnsOption,
-    Force,
-    GroupOption,
-    InvertOption,
-    Jobs,
-    Json,
-    LandmarksOption,
-    LowerOption,
-    MandibleOption,
-    Method,
-    Outside,
-    PrimName,
-    RestOption,
-    RigidOption,
-    UnitOption,
-    UpperOption,
-    subject_given,
-    trajectory_options,
-)
 from jawusd.cli.output import emit, progress, refuse_any, say
 from jawusd.formats.atomic import refuse_existing
 
@@ -46,9 +25,9 @@ BackendOption = Annotated[Backend, typer.Option(help="Renderer of --solver paper
 
 def build(
     context: typer.Context,
-    capture: CaptureArg,
+    capture: options.CaptureArg,
     out: Annotated[Path, typer.Option("-o", "--out", help="Folder of the rig.")],
-    model: Annotated[Method, typer.Option(help="Form of the jaw model.")] = "anchored",
+    model: Annotated[options.Method, typer.Option(help="Form of the jaw model.")] = "anchored",
     solver: SolverOption = "contour",
     backend: BackendOption = "cpu",
     resume: Annotated[bool, typer.Option("--resume", help="Continue an earlier build in this folder.")] = False,
@@ -56,11 +35,11 @@ def build(
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="List the stages that would run or be reused, with estimated times.")
     ] = False,
-    jobs: Jobs = 2,
-    prim_name: PrimName = None,
+    jobs: options.Jobs = 2,
+    prim_name: options.PrimName = None,
     verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Print the results of all stages.")] = False,
-    allow_outside: Outside = False,
-    as_json: Json = False,
+    allow_outside: options.Outside = False,
+    as_json: options.Json = False,
 ) -> None:
     """Build a rig from a capture: calibrate if needed, sync, track, fit, track uncertain frames again, bake."""
     from jawusd.cli.text_build import build_lines, plan_lines
@@ -68,7 +47,7 @@ def build(
 
     map_large_arrays()
     _check_backend(solver, backend)
-    options = stages.BuildOptions(
+    settings = stages.BuildOptions(
         model,
         solver,
         backend,
@@ -80,16 +59,16 @@ def build(
         command=command_line(context),
     )
     if dry_run:
-        plan = stages.plan_build(capture, out, options)
+        plan = stages.plan_build(capture, out, settings)
         emit({"stages": [asdict(stage) for stage in plan]}, as_json, plan_lines(plan))
         return
     with progress() as report:
-        summary = stages.build(capture, out, options, report, lambda found: say(found.line(), err=True))
+        summary = stages.build(capture, out, settings, report, lambda found: say(found.line(), err=True))
     emit(summary, as_json, build_lines(summary, verbose))
 
 
 def track(
-    capture: CaptureArg,
+    capture: options.CaptureArg,
     out: Annotated[Path, typer.Option("-o", "--out", help="File of the tracks.")] = Path("tracks.npz"),
     solver: SolverOption = "contour",
     backend: BackendOption = "cpu",
@@ -100,10 +79,10 @@ def track(
             help="Folder for videos of the tracked scans over the footage, or an .mp4 of all cameras side by side."
         ),
     ] = None,
-    jobs: Jobs = 2,
-    force: Force = False,
-    allow_outside: Outside = False,
-    as_json: Json = False,
+    jobs: options.Jobs = 2,
+    force: options.Force = False,
+    allow_outside: options.Outside = False,
+    as_json: options.Json = False,
 ) -> None:
     """Track the teeth of both jaws in masks or, without masks, in the videos."""
     from jawusd.cli.text_build import track_lines
@@ -146,22 +125,22 @@ def fit(
             help="tracks.npz, a CSV of poses, HDF5 of jaw-tracking-system, or with --rigid a table of markers."
         ),
     ],
-    capture: CaptureOption = None,
-    upper_teeth: UpperOption = None,
-    lower_teeth: LowerOption = None,
-    mandible: MandibleOption = None,
-    landmarks: LandmarksOption = None,
-    columns: ColumnsOption = None,
-    length_unit: UnitOption = "mm",
-    invert: InvertOption = False,
-    rest_frame: RestOption = None,
-    group: GroupOption = None,
-    rigid: RigidOption = None,
+    capture: options.CaptureOption = None,
+    upper_teeth: options.UpperOption = None,
+    lower_teeth: options.LowerOption = None,
+    mandible: options.MandibleOption = None,
+    landmarks: options.LandmarksOption = None,
+    columns: options.ColumnsOption = None,
+    length_unit: options.UnitOption = "mm",
+    invert: options.InvertOption = False,
+    rest_frame: options.RestOption = None,
+    group: options.GroupOption = None,
+    rigid: options.RigidOption = None,
     out: Annotated[Path, typer.Option("-o", "--out", help="File of the model.")] = Path("model.npz"),
-    model: Annotated[Method, typer.Option(help="Form of the jaw model.")] = "anchored",
-    force: Force = False,
-    allow_outside: Outside = False,
-    as_json: Json = False,
+    model: Annotated[options.Method, typer.Option(help="Form of the jaw model.")] = "anchored",
+    force: options.Force = False,
+    allow_outside: options.Outside = False,
+    as_json: options.Json = False,
 ) -> None:
     """Fit a three-parameter jaw model to tracks or other poses."""
     from jawusd.cli.text_build import fit_lines
@@ -169,8 +148,8 @@ def fit(
     from jawusd.pipeline.fit import fit_subject, fit_summary, read_motion
 
     refuse_existing(out, force)
-    motion, fps = read_motion(poses, trajectory_options(columns, length_unit, invert, rest_frame, group, rigid))
-    subject = subject_given(poses.stem, capture, upper_teeth, lower_teeth, mandible, landmarks, allow_outside)
+    motion, fps = read_motion(poses, options.trajectory_options(columns, length_unit, invert, rest_frame, group, rigid))
+    subject = options.subject_given(poses.stem, capture, upper_teeth, lower_teeth, mandible, landmarks, allow_outside)
     with progress() as report, naming_file(poses):
         fitted = fit_subject(subject, motion, model, report, fps)
     save_model(out, fitted)
@@ -181,16 +160,16 @@ def fit(
 def bake(
     model: Annotated[Path, typer.Argument(help="model.npz.")],
     out: Annotated[Path, typer.Option("-o", "--out", help="Folder of the rig.")],
-    capture: CaptureOption = None,
-    upper_teeth: UpperOption = None,
-    lower_teeth: LowerOption = None,
-    mandible: MandibleOption = None,
+    capture: options.CaptureOption = None,
+    upper_teeth: options.UpperOption = None,
+    lower_teeth: options.LowerOption = None,
+    mandible: options.MandibleOption = None,
     fps: Annotated[float, typer.Option(min=0.001, help="Frames per second, for a subject without a capture.")] = 24.0,
     table: Annotated[int, typer.Option(help="Knots per axis of the sampled decoder: 17, 33 or 65.")] = 33,
-    prim_name: PrimName = None,
-    force: Force = False,
-    allow_outside: Outside = False,
-    as_json: Json = False,
+    prim_name: options.PrimName = None,
+    force: options.Force = False,
+    allow_outside: options.Outside = False,
+    as_json: options.Json = False,
 ) -> None:
     """Write the OpenUSD rig of a model, with the meshes of a capture or loose scans."""
     from jawusd.formats.model import load_model
@@ -199,7 +178,7 @@ def bake(
     refuse_existing(out / "actor.usda", force)
     loaded = load_model(model)
     name = str(loaded.meta.get("actor") or model.stem)
-    subject = subject_given(name, capture, upper_teeth, lower_teeth, mandible, None, allow_outside)
+    subject = options.subject_given(name, capture, upper_teeth, lower_teeth, mandible, None, allow_outside)
     check_same_jaw(subject, loaded)
     with progress() as report:
         files = bake_subject(subject, loaded, out, report, fps=fps, table_size=table, prim_name=prim_name)
@@ -210,7 +189,7 @@ def demo(
     out: Annotated[Path, typer.Option("-o", "--out", help="Folder of the capture.")],
     seed: Annotated[int, typer.Option(min=0, help="Seed of the random subject.")] = 0,
     frames: Annotated[int, typer.Option(min=24, max=20000, help="Number of exercise frames.")] = 240,
-    force: Force = False,
+    force: options.Force = False,
 ) -> None:
     """Render a synthetic capture with ground truth: a random subject in front of three cameras.
 
@@ -239,7 +218,7 @@ def build_many(
         ),
     ],
     out: Annotated[Path, typer.Option("-o", "--out", help="Parent folder of the rigs' folders.")],
-    model: Annotated[Method, typer.Option(help="Form of the jaw models.")] = "anchored",
+    model: Annotated[options.Method, typer.Option(help="Form of the jaw models.")] = "anchored",
     cluster: Annotated[
         str | None,
         typer.Option(
@@ -255,8 +234,8 @@ def build_many(
     resume: Annotated[bool, typer.Option("--resume", help="Continue earlier builds in this folder.")] = False,
     fresh: Annotated[bool, typer.Option("--fresh", help="Delete earlier builds in this folder first.")] = False,
     jobs: Annotated[int, typer.Option(min=1, max=64, help="Threads of each build.")] = 1,
-    allow_outside: Outside = False,
-    as_json: Json = False,
+    allow_outside: options.Outside = False,
+    as_json: options.Json = False,
 ) -> None:
     """Build many captures, one process each; a failure does not stop the others. Exit code 1 if any failed."""
     from jawusd.cli.text_build import outcome_lines
@@ -274,9 +253,9 @@ def build_many(
         allow_outside=allow_outside,
         command=command_line(context),
     )
-    options = many.ManyOptions(build, cluster, workers, retries)
+    settings = many.ManyOptions(build, cluster, workers, retries)
     with stopped_by_signals():
-        outcomes = many.build_many(load_capture_list(captures), out, options, lambda line: say(line, err=True))
+        outcomes = many.build_many(load_capture_list(captures), out, settings, lambda line: say(line, err=True))
     data = {"folder": str(out), "builds": [asdict(outcome) for outcome in outcomes]}
     emit(data, as_json, outcome_lines(outcomes))
     if any(outcome.status == many.FAILED for outcome in outcomes):

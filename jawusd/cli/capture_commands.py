@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 
 from jawusd.base.errors import CaptureError, OutputError, SyncError, TrackingError
-from jawusd.cli.options import CaptureArg, Force, Jobs, Json, Outside
+from jawusd.cli import options
 from jawusd.cli.output import emit, plain, progress, refuse_any
 from jawusd.formats.atomic import refuse_existing, write_text_atomic
 
@@ -22,8 +22,8 @@ def init(
     ] = None,
     fps: Annotated[float | None, typer.Option(min=0.001, max=10000.0, help="Frames per second.")] = None,
     reference: Annotated[bool, typer.Option("--reference", help="List every key of capture.toml and exit.")] = False,
-    force: Force = False,
-    as_json: Json = False,
+    force: options.Force = False,
+    as_json: options.Json = False,
 ) -> None:
     """Draft a commented capture.toml from a folder of footage and scans, and list what is missing.
 
@@ -55,7 +55,7 @@ def _print_reference(as_json: bool) -> None:
     emit({"keys": [asdict(entry) for entry in keys]}, as_json, reference_lines(keys, 80))
 
 
-def doctor(as_json: Json = False) -> None:
+def doctor(as_json: options.Json = False) -> None:
     """Check the installation: versions, extras, OpenGL, codecs, CPU cores, and the cache of compiled code.
 
     Exit code 1 if something that a build needs is missing.
@@ -82,8 +82,8 @@ def cameras(
     size: Annotated[
         str | None, typer.Option(help="Image size, such as 1920x1080, if the source does not state it.")
     ] = None,
-    force: Force = False,
-    as_json: Json = False,
+    force: options.Force = False,
+    as_json: options.Json = False,
 ) -> None:
     """Convert calibrated cameras between the file formats of other programs, in mm."""
     from jawusd.cli.text_capture import camera_lines
@@ -101,7 +101,7 @@ def cameras(
     emit(data, as_json, camera_lines(found, files))
 
 
-def check(capture: CaptureArg, allow_outside: Outside = False, as_json: Json = False) -> None:
+def check(capture: options.CaptureArg, allow_outside: options.Outside = False, as_json: options.Json = False) -> None:
     """Check a capture in seconds: scans, masks, clips, calibration, picks, frames, disk space.
 
     Prints all errors and warnings at once. Exit code 0 without errors, 5 with errors.
@@ -119,12 +119,12 @@ def check(capture: CaptureArg, allow_outside: Outside = False, as_json: Json = F
 
 
 def calibrate(
-    capture: CaptureArg,
+    capture: options.CaptureArg,
     out: Annotated[Path, typer.Option("-o", "--out", help="File of the calibration.")] = Path("calibration.toml"),
     report_file: Annotated[Path | None, typer.Option("--report", help="Also write the report as JSON.")] = None,
-    force: Force = False,
-    allow_outside: Outside = False,
-    as_json: Json = False,
+    force: options.Force = False,
+    allow_outside: options.Outside = False,
+    as_json: options.Json = False,
 ) -> None:
     """Calibrate the cameras from clips of a chessboard or ChArUco board, and report the expected accuracy."""
     from jawusd.cli.text_capture import calibration_lines
@@ -148,9 +148,9 @@ def sync(
     plot: Annotated[
         Path | None, typer.Option(help="Also draw the brightness before and after alignment, as PNG or SVG.")
     ] = None,
-    force: Force = False,
-    allow_outside: Outside = False,
-    as_json: Json = False,
+    force: options.Force = False,
+    allow_outside: options.Outside = False,
+    as_json: options.Json = False,
 ) -> None:
     """Estimate the frame offsets between cameras from light flashes or, without flashes, from sound."""
     from jawusd.cli.text_capture import sync_lines
@@ -203,7 +203,7 @@ def _named(clips: list[Path]) -> dict[str, Path]:
 
 
 def segment(
-    capture: CaptureArg,
+    capture: options.CaptureArg,
     out: Annotated[Path, typer.Option("-o", "--out", help="Folder of the masks.")] = Path("masks"),
     keys: Annotated[
         Path | None,
@@ -215,9 +215,9 @@ def segment(
     ] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Keep finished frames.")] = False,
     force: Annotated[bool, typer.Option("--force", help="Overwrite existing masks.")] = False,
-    jobs: Jobs = 2,
-    allow_outside: Outside = False,
-    as_json: Json = False,
+    jobs: options.Jobs = 2,
+    allow_outside: options.Outside = False,
+    as_json: options.Json = False,
 ) -> None:
     """Make masks of the teeth of both jaws from the videos, starting from picks or, without picks, from a search."""
     from jawusd.cli.text_capture import segment_lines
@@ -247,7 +247,7 @@ def _refuse_masks(folder: Path, record: Path, force: bool) -> None:
 
 
 def scans(
-    capture: CaptureArg,
+    capture: options.CaptureArg,
     out: Annotated[
         Path | None,
         typer.Option(
@@ -260,8 +260,8 @@ def scans(
     force: Annotated[
         bool, typer.Option("--force", help="Label again and overwrite existing labels, including reviewed ones.")
     ] = False,
-    allow_outside: Outside = False,
-    as_json: Json = False,
+    allow_outside: options.Outside = False,
+    as_json: options.Json = False,
 ) -> None:
     """Label the crowns and gums in both dental scans, store the labels, and draw an image for review."""
     from jawusd.cli.text_capture import scans_lines
@@ -273,11 +273,11 @@ def scans(
 
 
 def plates(
-    capture: CaptureArg,
+    capture: options.CaptureArg,
     rig: Annotated[Path, typer.Argument(help="Folder of the rig built from the capture.")],
-    force: Force = False,
-    allow_outside: Outside = False,
-    as_json: Json = False,
+    force: options.Force = False,
+    allow_outside: options.Outside = False,
+    as_json: options.Json = False,
 ) -> None:
     """Write undistorted footage at the paths in the rig's cameras.usda, numbered by its time codes."""
     from jawusd.formats.tracks import load_tracks
@@ -306,8 +306,8 @@ def photos(
     out: Annotated[
         Path, typer.Option("-o", "--out", help="Folder for photos.json and an overlay per photograph.")
     ] = Path("photos"),
-    force: Force = False,
-    as_json: Json = False,
+    force: options.Force = False,
+    as_json: options.Json = False,
 ) -> None:
     """Register two scans in occlusion, from outlines drawn in photographs of the closed bite.
 

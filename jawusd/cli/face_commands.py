@@ -12,9 +12,9 @@ import typer
 
 import jawusd
 from jawusd.base.errors import naming_file
+from jawusd.cli import options
 from jawusd.cli.animate_commands import rate_of
 from jawusd.cli.animate_commands import read_face as read_arkit_motion
-from jawusd.cli.options import Allow, Force, Json, Prim, RigArg, UnitOption, rigid_bodies
 from jawusd.cli.output import emit
 from jawusd.evaluator import JawRig
 from jawusd.evaluator.skin import Skin
@@ -80,7 +80,7 @@ HeadError = Annotated[
 
 
 def skin_fit(
-    rig: RigArg,
+    rig: options.RigArg,
     take: TakeArg,
     face: FaceArg,
     out: Out = Path("skin.npz"),
@@ -90,12 +90,12 @@ def skin_fit(
     bite: Bites = None,
     rigid: Rigid = None,
     rest_frame: RestFrame = None,
-    length_unit: UnitOption = "mm",
+    length_unit: options.UnitOption = "mm",
     head_error: HeadError = (0.3, 0.15),
-    force: Force = False,
-    prim: Prim = None,
-    allow: Allow = None,
-    as_json: Json = False,
+    force: options.Force = False,
+    prim: options.Prim = None,
+    allow: options.Allow = None,
+    as_json: options.Json = False,
 ) -> None:
     """Learn d from facial skin in frames with visible teeth, to estimate the jaw in frames with closed lips.
 
@@ -106,23 +106,23 @@ def skin_fit(
 
     refuse_existing(out, force)
     bites = [_frames(text) for text in bite or ()]
-    seen = read_face(face, fps, length_unit, rigid_bodies(rigid), rest_frame)
+    seen = read_face(face, fps, length_unit, options.rigid_bodies(rigid), rest_frame)
     error = (head_error[0], math.radians(head_error[1]))
     _learn(rig, take, seen, out, jaw_fps, offset, prim, as_json, bites, error)
 
 
 def arkit_fit(
-    rig: RigArg,
+    rig: options.RigArg,
     face: Annotated[Path, typer.Argument(help="ARKit face capture, the CSV of Live Link Face.")],
     take: TakeArg,
     out: Out = Path("arkit.npz"),
     fps: Fps = None,
     jaw_fps: JawFps = None,
     offset: Offset = None,
-    force: Force = False,
-    prim: Prim = None,
-    allow: Allow = None,
-    as_json: Json = False,
+    force: options.Force = False,
+    prim: options.Prim = None,
+    allow: options.Allow = None,
+    as_json: options.Json = False,
 ) -> None:
     """Learn d from the four ARKit jaw weights, as skin-fit does from all blend shapes, for `animate` and `arkit-table`.
 
@@ -182,13 +182,13 @@ def _frames(text: str) -> tuple[int, int]:
 
 
 def align(
-    rig: RigArg,
+    rig: options.RigArg,
     correspondences: Annotated[Path, typer.Argument(help="Points of the face model and of the rig (JSON).")],
     out: Annotated[Path, typer.Option("-o", "--out", help="Alignment to write (JSON).")] = Path("T_skull_model.json"),
-    force: Force = False,
-    prim: Prim = None,
-    allow: Allow = None,
-    as_json: Json = False,
+    force: options.Force = False,
+    prim: options.Prim = None,
+    allow: options.Allow = None,
+    as_json: options.Json = False,
 ) -> None:
     """Align a face model (FLAME, SMPL-X, ICT-FaceKit, any) with the skull frame of a rig, by a few named points.
 

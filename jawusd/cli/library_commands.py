@@ -9,8 +9,8 @@ from typing import Annotated, Literal
 
 import typer
 
+from jawusd.cli import options
 from jawusd.cli.motion import carried_over, emit_motion
-from jawusd.cli.options import Allow, Force, Json, Prim, PrimName, rig_of_folder
 from jawusd.cli.output import emit, progress
 from jawusd.formats.atomic import refuse_existing
 from jawusd.formats.landmarks import load_landmarks
@@ -26,9 +26,9 @@ def retarget(
         Path | None, typer.Argument(help="Motion of --from: an animation layer, keys.json, or a CSV of d or poses.")
     ] = None,
     source: Annotated[
-        Path | None, typer.Option("--from", help="Rig for which the motion was made.", callback=rig_of_folder)
+        Path | None, typer.Option("--from", help="Rig for which the motion was made.", callback=options.rig_of_folder)
     ] = None,
-    target: Annotated[Path | None, typer.Option("--to", help="Target rig.", callback=rig_of_folder)] = None,
+    target: Annotated[Path | None, typer.Option("--to", help="Target rig.", callback=options.rig_of_folder)] = None,
     landmarks: Annotated[
         Path | None, typer.Option(help="Landmarks (JSON) of a subject without a capture, instead of a motion.")
     ] = None,
@@ -43,10 +43,10 @@ def retarget(
         Path | None,
         typer.Option("-o", "--out", help="Layer of the motion (retargeted.usdc) or model of the subject (model.npz)."),
     ] = None,
-    force: Force = False,
-    prim: Prim = None,
-    allow: Allow = None,
-    as_json: Json = False,
+    force: options.Force = False,
+    prim: options.Prim = None,
+    allow: options.Allow = None,
+    as_json: options.Json = False,
 ) -> None:
     """Retarget a motion to another rig, or make a rig for a subject from landmarks and a library."""
     if landmarks and library_folder and not any((anim, source, target, fps)):
@@ -99,7 +99,8 @@ def library(
     add: Annotated[
         Path | None,
         typer.Option(
-            help="First copy this rig (its folder, actor.usda or model.npz) into the library.", callback=rig_of_folder
+            help="First copy this rig (its folder, actor.usda or model.npz) into the library.",
+            callback=options.rig_of_folder,
         ),
     ] = None,
     name: Annotated[
@@ -108,9 +109,9 @@ def library(
     plot: Annotated[
         Path | None, typer.Option(help="Folder for ranges.png and ranges.svg of the listed subjects.")
     ] = None,
-    force: Force = False,
-    allow: Allow = None,
-    as_json: Json = False,
+    force: options.Force = False,
+    allow: options.Allow = None,
+    as_json: options.Json = False,
 ) -> None:
     """Manage many actors: update the index library.json, list, search, compare and plot."""
     from jawusd.pipeline.library import add_rig, open_library, plot_ranges
@@ -177,10 +178,10 @@ def publish(
     ],
     out: Annotated[Path, typer.Option("-o", "--out", help="Folder to write, or the .usdz of a shot.")],
     prefix: Annotated[str | None, typer.Option(help="Prefix of all file names. Default: the actor's name.")] = None,
-    prim_name: PrimName = None,
-    force: Force = False,
-    allow: Allow = None,
-    as_json: Json = False,
+    prim_name: options.PrimName = None,
+    force: options.Force = False,
+    allow: options.Allow = None,
+    as_json: options.Json = False,
 ) -> None:
     """Copy a rig under unique file names, so that several actors can be packed together; or pack a shot as .usdz."""
     from jawusd.rig.publish import publish_rig, write_package

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from jawusd.base.arrays import Array, Mask
 from jawusd.base.errors import FormatError, naming_file
 from jawusd.base.inputs import check_input
-from jawusd.cli.options import USD_SUFFIXES
+from jawusd.cli import options
 from jawusd.cli.output import emit
 from jawusd.evaluator.authoring import smooth_tangents
 from jawusd.evaluator.clamping import Inside
@@ -260,7 +260,7 @@ def _motion_of(rig: JawRig, path: Path, prim: str | None) -> AuthoredMotion:
     from jawusd.rig.motion_read import read_parameters_of_stage, read_poses_of_stage
     from jawusd.rig.read import open_stage
 
-    if path.suffix.lower() not in USD_SUFFIXES:
+    if path.suffix.lower() not in options.USD_SUFFIXES:
         return read_motion(rig, path)
     sampled = read_parameters_of_stage(path, prim)
     if sampled is not None:

@@ -13,26 +13,7 @@ import typer
 
 from jawusd.base.errors import naming_file
 from jawusd.base.guard import map_large_arrays
-from jawusd.cli.options import (
-    Allow,
-    CaptureOption,
-    ColumnsOption,
-    Force,
-    GroupOption,
-    InvertOption,
-    Json,
-    LandmarksOption,
-    LowerOption,
-    MandibleOption,
-    Outside,
-    Prim,
-    RestOption,
-    RigidOption,
-    UnitOption,
-    UpperOption,
-    subject_given,
-    trajectory_options,
-)
+from jawusd.cli import options
 from jawusd.cli.output import emit, progress, refuse_any, say
 from jawusd.formats.atomic import refuse_existing
 
@@ -58,24 +39,24 @@ def report(
             help="Folder of the figures, or page of a solve. Default: DIR/experiments, or beside the tracks.",
         ),
     ] = None,
-    capture: CaptureOption = None,
-    upper_teeth: UpperOption = None,
-    lower_teeth: LowerOption = None,
-    mandible: MandibleOption = None,
-    landmarks: LandmarksOption = None,
-    columns: ColumnsOption = None,
-    length_unit: UnitOption = "mm",
-    invert: InvertOption = False,
-    rest_frame: RestOption = None,
-    group: GroupOption = None,
-    rigid: RigidOption = None,
+    capture: options.CaptureOption = None,
+    upper_teeth: options.UpperOption = None,
+    lower_teeth: options.LowerOption = None,
+    mandible: options.MandibleOption = None,
+    landmarks: options.LandmarksOption = None,
+    columns: options.ColumnsOption = None,
+    length_unit: options.UnitOption = "mm",
+    invert: options.InvertOption = False,
+    rest_frame: options.RestOption = None,
+    group: options.GroupOption = None,
+    rigid: options.RigidOption = None,
     starts: Annotated[int, typer.Option(min=1, max=64, help="Number of random starts of the paper's networks.")] = 2,
     force: Annotated[bool, typer.Option("--force", help="Overwrite existing figures, or the page of a solve.")] = False,
-    allow_outside: Outside = False,
-    as_json: Json = False,
+    allow_outside: options.Outside = False,
+    as_json: options.Json = False,
 ) -> None:
     """Write the report of a build or a solve again, or repeat the paper's experiments on a take."""
-    options = trajectory_options(columns, length_unit, invert, rest_frame, group, rigid)
+    settings = options.trajectory_options(columns, length_unit, invert, rest_frame, group, rigid)
     if not experiments:
         _report_found(source, capture, out, force, allow_outside, as_json)
         return
@@ -88,10 +69,10 @@ def report(
     folder = out or source / "experiments"
     refuse_any(force, *stage.experiment_files(folder))
     poses = stage.fitted_poses(source) if source.is_dir() else source
-    motion, _ = read_motion(poses, options)
+    motion, _ = read_motion(poses, settings)
     given = (capture, upper_teeth, lower_teeth, mandible, landmarks)
     built = source.is_dir() and not any(given)
-    subject = subject_of_build(source) if built else subject_given(source.stem, *given, allow_outside)
+    subject = subject_of_build(source) if built else options.subject_given(source.stem, *given, allow_outside)
     with progress() as tell, naming_file(poses):
         found = stage.run_paper_experiments(subject, motion, starts, tell)
         files = stage.draw_experiments(found, folder)
@@ -164,10 +145,10 @@ def view(
     ] = True,
     page: PageOption = None,
     footage: Annotated[bool, typer.Option("--footage", help="Also write the footage of the take into --page.")] = False,
-    force: Force = False,
-    allow_outside: Outside = False,
-    prim: Prim = None,
-    allow: Allow = None,
+    force: options.Force = False,
+    allow_outside: options.Outside = False,
+    prim: options.Prim = None,
+    allow: options.Allow = None,
 ) -> None:
     """View and animate a rig in the browser; or view the footage of a capture, to inspect poses and set picks."""
     capture = False

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 import jawusd
 from jawusd.base.arrays import Array
 from jawusd.base.plugin_path import VARIABLE, schema_folder
+from jawusd.cli import options
 from jawusd.cli.face_commands import (
     AlignOption,
     CsvOption,
@@ -24,17 +25,6 @@ from jawusd.cli.face_commands import (
     judge_face,
 )
 from jawusd.cli.motion import read_pose_table
-from jawusd.cli.options import (
-    USD_SUFFIXES,
-    Allow,
-    Force,
-    Json,
-    OptionalRigArg,
-    Prim,
-    RigArg,
-    changed_in_folder,
-    load_named,
-)
 from jawusd.cli.output import emit, refuse_any
 from jawusd.cli.text_build import contact_words, frame_lines, joint_words, track_lines
 from jawusd.evaluator import JawRig, Reason
@@ -55,15 +45,15 @@ Triple = tuple[float, float, float]
 
 def info(
     context: typer.Context,
-    rig: OptionalRigArg = None,
+    rig: options.OptionalRigArg = None,
     schema: Annotated[
         bool,
         typer.Option("--schema", help="Print the path of the USD schema JawRigAPI, and how other programs find it."),
     ] = False,
     frame: Annotated[int | None, typer.Option(help="For tracks.npz: describe the tracking of this frame.")] = None,
-    prim: Prim = None,
-    allow: Allow = None,
-    as_json: Json = False,
+    prim: options.Prim = None,
+    allow: options.Allow = None,
+    as_json: options.Json = False,
 ) -> None:
     """Describe a rig file or tracks."""
     if schema:
@@ -87,7 +77,7 @@ def info(
     from jawusd.pipeline.state import recorded_verdict
     from jawusd.rig import describe
 
-    found, changed, verdict = describe(rig, prim), changed_in_folder(context), recorded_verdict(rig.parent)
+    found, changed, verdict = describe(rig, prim), options.changed_in_folder(context), recorded_verdict(rig.parent)
     whole = {**found, "verdict": verdict, "changed": [finding.as_json() for finding in changed]}
     first = [] if verdict is None else [verdict]
     emit(whole, as_json, [*first, *_info_lines(found), *(finding.line() for finding in changed)])
@@ -139,14 +129,14 @@ def _info_lines(found: Description) -> list[str]:
 
 
 def pose(
-    rig: RigArg,
+    rig: options.RigArg,
     d: Annotated[
         Triple,
         typer.Option("--d", metavar="D1 D2 D3", help="Opening, laterotrusion (+ left), protrusion (+ forward) [mm]."),
     ],
-    prim: Prim = None,
-    allow: Allow = None,
-    as_json: Json = False,
+    prim: options.Prim = None,
+    allow: options.Allow = None,
+    as_json: options.Json = False,
 ) -> None:
     """Print the jaw pose at parameters d: 4x4 matrix, twist, landmarks, tooth clearance, and margin to the bound."""
     loaded = jawusd.load(rig, prim=prim)
@@ -177,7 +167,7 @@ def _check_finite(values: Triple, option: str) -> None:
 
 def validate(
     context: typer.Context,
-    rig: RigArg,
+    rig: options.RigArg,
     poses: Annotated[
         Path | None, typer.Argument(help="CSV or JSON of poses or of d, tracks.npz, or an animated USD stage.")
     ] = None,
@@ -195,10 +185,10 @@ def validate(
     mapping: MappingOption = None,
     csv: CsvOption = None,
     strip: StripOption = None,
-    force: Force = False,
-    prim: Prim = None,
-    allow: Allow = None,
-    as_json: Json = False,
+    force: options.Force = False,
+    prim: options.Prim = None,
+    allow: options.Allow = None,
+    as_json: options.Json = False,
 ) -> None:
     """Check a rig, or poses or a face track against a rig; exit code 1 if something is invalid.
 
@@ -225,10 +215,10 @@ def validate(
     if align or mapping or csv or strip:
         raise typer.BadParameter("is needed for --align, --mapping, --csv and --strip.", param_hint="--face")
     if poses is None:
-        _validate_rig(rig, changed_in_folder(context), as_json)
+        _validate_rig(rig, options.changed_in_folder(context), as_json)
         return
 
-    loaded = load_named(rig, prim, poses)
+    loaded = options.load_named(rig, prim, poses)
     more, stale = _unbaked(loaded, poses, prim)
     frames, T = _poses_or_parameters(loaded, poses, prim)
     verdicts = loaded.validate(T, residual_limit_mm=residual_mm, tolerance_mm=tolerance_mm)
@@ -269,7 +259,7 @@ def _unbaked(rig: JawRig, path: Path, prim: str | None) -> tuple[dict[str, objec
     """Return figures and a warning if the mandible's transform in a stage deviates from its d; empty if both agree."""
     from jawusd.rig.rebake import deviation
 
-    away = deviation(path, rig, prim) if path.suffix.lower() in USD_SUFFIXES else None
+    away = deviation(path, rig, prim) if path.suffix.lower() in options.USD_SUFFIXES else None
     if away is None or not away.frames:
         return {}, []
     message = f"the mandible deviates from d in {away.frames} of {away.of} frames and keys, by up to "
@@ -277,7 +267,7 @@ def _unbaked(rig: JawRig, path: Path, prim: str | None) -> tuple[dict[str, objec
 
 
 def _poses_or_parameters(rig: JawRig, path: Path, prim: str | None) -> tuple[NDArray[np.int64], Array]:
-    if path.suffix.lower() in USD_SUFFIXES:
+    if path.suffix.lower() in options.USD_SUFFIXES:
         from jawusd.rig.motion_read import read_poses_of_stage
 
         return read_poses_of_stage(path, prim)
@@ -309,13 +299,13 @@ def _validate_rig(path: Path, changed: list[Changed], as_json: bool) -> None:
 
 
 def ik(
-    rig: RigArg,
+    rig: options.RigArg,
     point: Annotated[Triple, typer.Option(metavar="X Y Z", help="Point on the mandible at rest [mm].")],
     target: Annotated[Triple, typer.Option(metavar="X Y Z", help="Target of the point, skull frame [mm].")],
     start: Annotated[Triple | None, typer.Option(metavar="D1 D2 D3", help="Initial parameters [mm].")] = None,
-    prim: Prim = None,
-    allow: Allow = None,
-    as_json: Json = False,
+    prim: options.Prim = None,
+    allow: options.Allow = None,
+    as_json: options.Json = False,
 ) -> None:
     """Find the valid parameters that move a point of the mandible closest to a target."""
     for values, option in ((point, "--point"), (target, "--target"), (start or point, "--start")):

@@ -8,20 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
+from jawusd.cli import options
 from jawusd.cli.face_commands import Fps, RestFrame, Rigid
-from jawusd.cli.options import (
-    Allow,
-    Force,
-    Jobs,
-    Json,
-    LengthUnit,
-    Outside,
-    Prim,
-    RigArg,
-    UnitOption,
-    named_values,
-    rigid_bodies,
-)
 from jawusd.cli.output import emit, progress, refuse_any, say, shortened
 from jawusd.formats.finding import Finding
 
@@ -81,7 +69,7 @@ SkinOnly = Annotated[bool, typer.Option("--skin-only", help="Ignore the images: 
 
 
 def solve(
-    rig: RigArg,
+    rig: options.RigArg,
     shot: ShotArg,
     out: Annotated[
         Path, typer.Option("-o", "--out", help="Table of d (.csv), tracks (.npz) or animation layer (.usdc).")
@@ -96,14 +84,14 @@ def solve(
     offset: FaceOffset = None,
     rigid: Rigid = None,
     rest_frame: RestFrame = None,
-    length_unit: UnitOption = "mm",
+    length_unit: options.UnitOption = "mm",
     skin_only: SkinOnly = False,
-    jobs: Jobs = 2,
-    force: Force = False,
-    allow_outside: Outside = False,
-    prim: Prim = None,
-    allow: Allow = None,
-    as_json: Json = False,
+    jobs: options.Jobs = 2,
+    force: options.Force = False,
+    allow_outside: options.Outside = False,
+    prim: options.Prim = None,
+    allow: options.Allow = None,
+    as_json: options.Json = False,
 ) -> None:
     """Track a performance of a subject with a rig, from masks or, without masks, videos of one or more cameras."""
     from jawusd.pipeline import solve as stage
@@ -143,14 +131,14 @@ def _skin_options(
     offset_s: float | None,
     rigid: list[str] | None,
     rest_frame: int | None,
-    unit: LengthUnit,
+    unit: options.LengthUnit,
     only: bool = False,
 ) -> SkinOptions | None:
     """Return the options about facial skin; None without it."""
     from jawusd.pipeline.skin import SkinOptions
 
     if skin is not None and face is not None:
-        return SkinOptions(skin, face, fps, offset_s, unit, rigid_bodies(rigid), rest_frame, only)
+        return SkinOptions(skin, face, fps, offset_s, unit, options.rigid_bodies(rigid), rest_frame, only)
     if skin is not None or face is not None or only:
         raise typer.BadParameter("needs both --skin and --face.", param_hint="--skin")
     return None
@@ -196,7 +184,7 @@ def solve_lines(summary: SolveSummary) -> list[str]:
 
 
 def live(
-    rig: RigArg,
+    rig: options.RigArg,
     shot: ShotArg,
     source: Annotated[
         list[str] | None,
@@ -217,12 +205,12 @@ def live(
     offset: LiveFaceOffset = 0.0,
     rigid: Rigid = None,
     rest_frame: RestFrame = None,
-    length_unit: UnitOption = "mm",
+    length_unit: options.UnitOption = "mm",
     silence: Annotated[float, typer.Option(min=0.1, help="Maximum time without an image from a source [s].")] = 10.0,
-    jobs: Jobs = 2,
-    allow_outside: Outside = False,
-    prim: Prim = None,
-    allow: Allow = None,
+    jobs: options.Jobs = 2,
+    allow_outside: options.Outside = False,
+    prim: options.Prim = None,
+    allow: options.Allow = None,
 ) -> None:
     """Track the jaw of a subject with a rig in live video; results are one line of JSON per frame, OSC, and a web page.
 
@@ -234,7 +222,7 @@ def live(
     from jawusd.pipeline.view import open_viewer
 
     given = _skin_options(skin, face, face_fps, offset, rigid, rest_frame, length_unit)
-    sources = named_values(source, "NAME=WHERE, such as mid=/dev/video0", "--source")
+    sources = options.named_values(source, "NAME=WHERE, such as mid=/dev/video0", "--source")
     sender = None if osc is None else OscSender(osc)
     viewer = open_viewer(rig, "127.0.0.1", port, prim, play=False) if view else None
     if viewer is not None:

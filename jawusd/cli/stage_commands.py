@@ -13,8 +13,8 @@ import typer
 
 from jawusd.base.arrays import Array
 from jawusd.base.errors import JawusdError
+from jawusd.cli import options
 from jawusd.cli.motion import AuthoredMotion, Changes, kept_inside, read_pose_table
-from jawusd.cli.options import USD_SUFFIXES, Allow, Force, Json, Prim, RigArg, load_named, rig_of_folder
 from jawusd.cli.output import emit
 from jawusd.evaluator import JawRig
 from jawusd.formats.atomic import refuse_existing
@@ -39,7 +39,7 @@ _ORIGINS: dict[Origin, str] = {"d": "values of d", "mandible": "mandible's trans
 
 
 def encode(
-    rig: RigArg,
+    rig: options.RigArg,
     poses: Annotated[
         Path, typer.Argument(help="CSV or JSON of poses, tracks.npz, or a stage, .fbx or .glb with the actor's meshes.")
     ],
@@ -48,10 +48,10 @@ def encode(
     ),
     mandible: MandiblePrim = None,
     skull: SkullPrim = None,
-    force: Force = False,
-    prim: Prim = None,
-    allow: Allow = None,
-    as_json: Json = False,
+    force: options.Force = False,
+    prim: options.Prim = None,
+    allow: options.Allow = None,
+    as_json: options.Json = False,
 ) -> None:
     """Convert poses to the nearest parameters d, with their distances from the model.
 
@@ -59,7 +59,7 @@ def encode(
     FBX and glTF are read through Blender.
     """
     refuse_existing(out, force)
-    loaded = load_named(rig, prim, poses)
+    loaded = options.load_named(rig, prim, poses)
     if holds_stage(poses):
         motion = read_stage_motion(loaded, rig, poses, prim, mandible, skull, "mandible")
         frames, d, residual_mm = motion.frames.astype(int), motion.d, motion.residual_mm
@@ -127,7 +127,7 @@ def read_stage_motion(
 
 def holds_stage(path: Path) -> bool:
     """Return whether a file is a stage, or can be converted to one by Blender."""
-    return path.suffix.lower() in (*USD_SUFFIXES, *SUFFIXES)
+    return path.suffix.lower() in (*options.USD_SUFFIXES, *SUFFIXES)
 
 
 def _fitted(
@@ -146,7 +146,7 @@ def _fitted(
 
 
 def _refuse_model(rig: Path) -> None:
-    if rig.suffix.lower() not in USD_SUFFIXES:
+    if rig.suffix.lower() not in options.USD_SUFFIXES:
         raise typer.BadParameter("must be the rig's USD file, because its meshes are needed.", param_hint="RIG")
 
 
@@ -198,7 +198,7 @@ def rebake(
         typer.Argument(
             help="The shot; or the rig, if STAGE is FBX, glTF or a stage with copies of the rig's meshes.",
             metavar="SHOT | RIG STAGE",
-            callback=rig_of_folder,
+            callback=options.rig_of_folder,
         ),
     ],
     stage: Annotated[Path | None, typer.Argument(help="Shot or animation layer, or an export of it.")] = None,
@@ -210,9 +210,9 @@ def rebake(
     prim: Annotated[
         list[str] | None, typer.Option("--prim", metavar="PRIM", help="Prim paths of the rigs to bake. Default: all.")
     ] = None,
-    allow: Allow = None,
-    force: Force = False,
-    as_json: Json = False,
+    allow: options.Allow = None,
+    force: options.Force = False,
+    as_json: options.Json = False,
 ) -> None:
     """Make d and the mandible's transform agree, for all rigs of a shot, where only one of the two was edited.
 
@@ -264,7 +264,7 @@ def _bake_rig(
     skull: str | None,
     origin: Origin | None,
 ) -> _BakedRig:
-    loaded = load_named(rig, prim, shot)
+    loaded = options.load_named(rig, prim, shot)
     found = read_stage_motion(loaded, rig, shot, prim, mandible, skull, origin)
     motion, changes = kept_inside(loaded, AuthoredMotion(found.frames, found.d, found.fps))
     return _BakedRig(loaded, found, motion, changes, judged_motion(loaded, found.frames, found.d, found.residual_mm))
@@ -279,7 +279,7 @@ def _write_baked(
 
     first = taken[0]
     motion = first.motion
-    if first.found.fitted and prim is not None and shot.suffix.lower() not in USD_SUFFIXES:
+    if first.found.fitted and prim is not None and shot.suffix.lower() not in options.USD_SUFFIXES:
         # in the other branches, `prim` is a path in the shot
         write_over(out, rig, first.rig, motion.frames, motion.d, first.found.fps, prim)
     elif first.found.fitted:
