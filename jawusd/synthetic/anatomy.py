@@ -16,7 +16,7 @@ from jawusd.base.arrays import Array
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry import transform_points
 from jawusd.meshes.bones import build_mandible, build_skull
-from jawusd.meshes.surfaces import Faces, grid_faces
+from jawusd.meshes.surfaces import Faces, grid_faces, superellipse
 from jawusd.synthetic.dental_arch import ArchShape, DentalArch, build_arch
 from jawusd.synthetic.kinematics import smoothstep
 from jawusd.synthetic.person import Person
@@ -179,7 +179,7 @@ class Face:
         """Build the grid, given the lower incisal point (3,) in occlusion, scan frame [mm]."""
         self._incisor_y = float(lower_incisor[1])
         angle = 2 * np.pi * (np.arange(_COLUMNS) + 0.5) / _COLUMNS
-        self._cos, self._sin = np.cos(angle), np.sin(angle)
+        self._angle, self._cos, self._sin = angle, np.cos(angle), np.sin(angle)
         # The lower lip moves with the jaw; the mouth corners move by a third of its motion.
         self._follow = smoothstep((0.35 - self._sin) / 0.95)
         lining_rows, lip_rows = 4, len(_LIP)
@@ -232,18 +232,17 @@ class Face:
         upper, lower = lips.upper_mm - middle, middle - (self._incisor_y - lips.lower_mm)
         shape = np.abs(self._sin) ** 0.8
         y = middle + np.where(self._sin > 0, upper, -lower) * shape
-        x = lips.width_mm * np.sign(self._cos) * np.abs(self._cos) ** 0.9
+        x = lips.width_mm * superellipse(self._angle, 0.9)[0]
         # Add the notch in the middle of the upper lip.
         y = y - 0.9 * np.exp(-((x / 4.0) ** 2)) * (self._sin > 0)
         return np.stack([x, y + lips.slant * x], -1)
 
     def _lining(self, lip_inner: Array) -> Array:
         """Return the rings of the mouth lining from the throat to the wet side of the lips, (4, columns, 3)."""
-        rings = []
+        rings, (x, y) = [], superellipse(self._angle, 0.7)
         for z, half_width, up, down in _LINING_RINGS:
-            x = half_width * np.sign(self._cos) * np.abs(self._cos) ** 0.7
-            y = np.where(self._sin > 0, up, down) * np.sign(self._sin) * np.abs(self._sin) ** 0.7
-            rings.append(np.stack([x, y - 1.0, np.full(_COLUMNS, z)], -1))
+            height = np.where(self._sin > 0, up, down) * y - 1.0
+            rings.append(np.stack([half_width * x, height, np.full(_COLUMNS, z)], -1))
         rings.append(0.5 * (rings[-1] + lip_inner) + [0.0, 0.0, 3.0])
         return np.stack(rings)
 
@@ -305,8 +304,8 @@ def tongue(forward_mm: float, up_mm: float, side_mm: float) -> Surface:
     height = 8.0 * (1.0 - 0.55 * t) * np.sqrt(np.clip(1.0 - t**6, 0.002, 1.0))
     z = -66.0 + (57.0 + forward_mm) * t
     lift = up_mm * smoothstep((t - 0.45) / 0.55)
-    x = width[:, None] * np.sign(np.cos(u)) * np.abs(np.cos(u)) ** 0.8 + side_mm * t[:, None] ** 2
-    top = np.sign(np.sin(u)) * np.abs(np.sin(u)) ** 0.8
+    across, top = superellipse(u, 0.8)
+    x = width[:, None] * across + side_mm * t[:, None] ** 2
     groove = 1.3 * np.exp(-((x / 3.0) ** 2)) * (top > 0) * np.sin(np.pi * t)[:, None]
     y = -8.0 + lift[:, None] + height[:, None] * top - groove
     vertices = np.stack([x, y, np.broadcast_to(z[:, None], x.shape)], -1).reshape(-1, 3)

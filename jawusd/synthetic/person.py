@@ -7,7 +7,6 @@ after Johnson and Winstanley 1997 and Cadiax studies, condylar travel after Muto
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -18,8 +17,6 @@ from jawusd.synthetic.kinematics import Joint, controlled_pose
 
 _LOWER = np.array([0.0, -1.0, -1.0])
 _UPPER = np.array([1.0, 1.0, 1.0])
-_COMPETING = 1.3  # exponent of the competing envelope
-EnvelopeKind = Literal["box", "competing"]
 
 
 def _asymmetric(rng: np.random.Generator, value: float, relative: float) -> Array:
@@ -82,18 +79,7 @@ class Person:
         mandible_points: points all over the mandible, for measuring pose errors, scan frame [mm], shape (42, 3).
     """
 
-    def __init__(self, seed: int, envelope: EnvelopeKind = "box") -> None:
-        """Draw a subject.
-
-        Args:
-            envelope: "box": lateral and protrusive range are independent; "competing": a wide lateral movement reduces
-                the protrusive range (|lateral|^1.3 + protrusion^1.3 <= 1).
-
-        Raises:
-            ValueError: the envelope is unknown.
-        """
-        if envelope not in ("box", "competing"):
-            raise ValueError(f"envelope must be 'box' or 'competing', got {envelope!r}")
+    def __init__(self, seed: int) -> None:
         rng = np.random.default_rng([seed, 0x7A77])
         self.seed = seed
         self.joint = draw_joint(rng)
@@ -101,7 +87,6 @@ class Person:
         self.mandible_points = _mandible_points(self.joint)
         first_molars = self.joint.incisor + np.array([[22.0, 0.5, -26.0], [-22.0, 0.5, -26.0]])
         self.landmarks = np.concatenate([self.joint.incisor[None], first_molars, self.joint.condyles])
-        self._envelope = envelope
 
     def pose(self, opening: ArrayLike, lateral: ArrayLike, protrusion: ArrayLike) -> Array:
         """Return mandible poses (..., 4, 4) on the three-parameter manifold of the subject; see `controlled_pose`."""
@@ -117,14 +102,8 @@ class Person:
         return controlled_pose(self.joint, opening, lateral, protrusion, extra_mm)
 
     def limit(self, controls: ArrayLike) -> Array:
-        """Return controls (..., 3) clipped to the envelope; lateral and protrusion are scaled down jointly."""
-        limited: Array = np.clip(np.asarray(controls, dtype=np.float64), _LOWER, _UPPER)
-        if self._envelope == "box":
-            return limited
-        opening, lateral, protrusion = np.moveaxis(limited, -1, 0)
-        size = (np.abs(lateral) ** _COMPETING + np.maximum(protrusion, 0.0) ** _COMPETING) ** (1.0 / _COMPETING)
-        shrink = 1.0 / np.maximum(size, 1.0)
-        return np.stack([opening, lateral * shrink, np.where(protrusion > 0, protrusion * shrink, protrusion)], -1)
+        """Return controls (..., 3) clipped to their ranges, which are independent of each other."""
+        return np.asarray(np.clip(np.asarray(controls, dtype=np.float64), _LOWER, _UPPER))
 
     def incisor(self, T_skull_mandible: ArrayLike) -> Array:
         """Return the displacement of the lower incisal point from rest [mm], scan axes, shape (..., 3)."""

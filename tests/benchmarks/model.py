@@ -24,7 +24,7 @@ from model_peers import PEERS  # noqa: E402
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
 
-from possible_poses import PossiblePoses  # noqa: E402
+from possible_poses import PERSONS, PossiblePoses  # noqa: E402
 
 from jawusd.evaluator import JawRig  # noqa: E402
 from jawusd.fitting import FittingConfig, fit_model  # noqa: E402
@@ -32,7 +32,6 @@ from jawusd.fitting.data import SubjectAnatomy, TrainingData, select_poses  # no
 from jawusd.geometry import make_transform, random_rotation, se3_exp, transform_points  # noqa: E402
 from jawusd.paper.model import fit_paper  # noqa: E402
 from jawusd.synthetic.exercises import record  # noqa: E402
-from jawusd.synthetic.person import Person  # noqa: E402
 
 TRAINING, HIDDEN, SEED_TRAINING, SEED_HIDDEN = 833, 5000, 1, 2
 SWEEPS = ((0, 0.0), (1, 0.0), (2, 0.0), (1, 15.0), (2, 15.0))  # axis, opening [mm]
@@ -44,7 +43,7 @@ class Subject:
     """One person with a training take and hidden poses."""
 
     def __init__(self, seed: int, envelope: str = "box") -> None:
-        self.person = Person(seed, envelope)
+        self.person = PERSONS[envelope](seed)
         self.T_anatomical_skull = make_transform(np.eye(3), -self.person.landmarks[0])
         self.hidden = record(self.person, HIDDEN, SEED_HIDDEN, "hidden").T_noisy
         self.possible = PossiblePoses(self.person)

@@ -8,6 +8,7 @@ points.
 import numpy as np
 
 from jawusd.geometry import transform_points
+from jawusd.synthetic.person import Person
 
 _LOWER, _UPPER = np.array([0.0, -1.0, -1.0]), np.array([1.0, 1.0, 1.0])
 _GRID = (13, 9, 9)
@@ -15,6 +16,24 @@ _STEPS = 30  # so many are needed near zero protrusion, where the manifold has a
 _DIFFERENCE = 1e-5
 _DAMPING = 1e-3  # relative to the scale of each control, since the controls' gradients differ by a factor of ten
 _CHUNK = 2000
+
+
+_COMPETING = 1.3  # exponent of the competing envelope
+
+
+class CompetingPerson(Person):
+    """A person in whom a wide lateral movement reduces the protrusive range: |lateral|^1.3 + protrusion^1.3 <= 1."""
+
+    def limit(self, controls):
+        """Return controls (..., 3) clipped to the envelope; lateral and protrusion are scaled down jointly."""
+        opening, lateral, protrusion = np.moveaxis(super().limit(controls), -1, 0)
+        size = (np.abs(lateral) ** _COMPETING + np.maximum(protrusion, 0.0) ** _COMPETING) ** (1.0 / _COMPETING)
+        shrink = 1.0 / np.maximum(size, 1.0)
+        return np.stack([opening, lateral * shrink, np.where(protrusion > 0, protrusion * shrink, protrusion)], -1)
+
+
+#: Persons by the kind of their envelope; in a box, the ranges do not depend on each other.
+PERSONS = {"box": Person, "competing": CompetingPerson}
 
 
 class PossiblePoses:

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from possible_poses import PossiblePoses
+from possible_poses import CompetingPerson, PossiblePoses
 
 from jawusd.geometry import rigidity_defect, se3_exp, se3_log, transform_point, transform_points
 from jawusd.synthetic.exercises import record
@@ -166,7 +166,7 @@ def test_unbounded_nearest_is_never_further_than_bounded(people: list[Person]) -
 
 
 def test_competing_envelope_refuses_the_corner_of_the_box() -> None:
-    box, competing = Person(5), Person(5, envelope="competing")
+    box, competing = Person(5), CompetingPerson(5)
     corner = box.pose(0.1, 0.95, 0.95)
     assert PossiblePoses(box).include(corner) and not PossiblePoses(competing).include(corner)
     take = record(competing, 400, 3)
@@ -175,8 +175,6 @@ def test_competing_envelope_refuses_the_corner_of_the_box() -> None:
 
 
 def test_bad_arguments_are_named() -> None:
-    with pytest.raises(ValueError, match="envelope"):
-        Person(0, envelope="sphere")
     with pytest.raises(ValueError, match="kind"):
         record(Person(0), 10, 0, kind="secret")
     with pytest.raises(ValueError, match="at least one frame"):
