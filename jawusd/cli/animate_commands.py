@@ -52,30 +52,6 @@ def _source_motion(loaded: JawRig, rig: Path, source: Path, prim: str | None) ->
     return AuthoredMotion(found.frames, found.d, found.fps)
 
 
-def _refuse_conflicts(
-    source: Path | None,
-    arkit: Path | None,
-    retarget_from: Path | None,
-    mapping: Path | None,
-    resample: float | None,
-    prim: str | None,
-    splines: Path | None,
-    out: Path,
-) -> None:
-    conflicts = (
-        ((source is None) == (arkit is None), "SOURCE", "give either a source or --arkit."),
-        (arkit and retarget_from, "--retarget-from", "needs a source; ARKit weights do not belong to a rig."),
-        (mapping and not arkit, "--mapping", "needs --arkit, whose weights it maps."),
-        (resample and retarget_from, "--resample", "needs a source made for this rig; retarget first."),
-        (prim and splines, "--splines", "cannot be combined with --prim."),
-        (_is_glb(out) and prim, "--prim", "needs a layer; a .glb is made from the actor's own file."),
-        (_is_glb(out) and splines, "--splines", "needs a layer, not a .glb."),
-    )
-    for conflict, option, why in conflicts:
-        if conflict:
-            raise typer.BadParameter(why, param_hint=option)
-
-
 def _is_glb(path: Path) -> bool:
     return path.suffix.lower() == ".glb"
 
@@ -135,7 +111,15 @@ def animate(
     """Write an animation layer over a rig, or meshes and motion as .glb; frames clamped to the bound are reported."""
     from jawusd.rig import describe
 
-    _refuse_conflicts(source, arkit, retarget_from, mapping, resample, prim, splines, out)
+    options.refuse_conflicts(
+        ((source is None) == (arkit is None), "SOURCE", "give either a source or --arkit."),
+        (arkit and retarget_from, "--retarget-from", "needs a source; ARKit weights do not belong to a rig."),
+        (mapping and not arkit, "--mapping", "needs --arkit, whose weights it maps."),
+        (resample and retarget_from, "--resample", "needs a source made for this rig; retarget first."),
+        (prim and splines, "--splines", "cannot be combined with --prim."),
+        (_is_glb(out) and prim, "--prim", "needs a layer; a .glb is made from the actor's own file."),
+        (_is_glb(out) and splines, "--splines", "needs a layer, not a .glb."),
+    )
     refuse_any(force, out, splines)
     loaded = jawusd.load(rig, prim=prim)
     if source is not None and retarget_from is not None:

@@ -30,7 +30,11 @@ def init(
     Exit code 1 if something must be filled in.
     """
     if reference:
-        _print_reference(as_json)
+        from jawusd.formats.capture import capture_keys
+        from jawusd.formats.capture_keys import reference_lines
+
+        keys = capture_keys()
+        emit({"keys": [asdict(entry) for entry in keys]}, as_json, reference_lines(keys, 80))
         return
     if folder is None:
         raise typer.BadParameter("give a folder or --reference.", param_hint="FOLDER")
@@ -45,14 +49,6 @@ def init(
     emit(found, as_json, start_lines(start))
     if start.missing:
         raise typer.Exit(1)
-
-
-def _print_reference(as_json: bool) -> None:
-    from jawusd.formats.capture import capture_keys
-    from jawusd.formats.capture_keys import reference_lines
-
-    keys = capture_keys()
-    emit({"keys": [asdict(entry) for entry in keys]}, as_json, reference_lines(keys, 80))
 
 
 def doctor(as_json: options.Json = False) -> None:

@@ -171,6 +171,17 @@ def rigid_bodies(given: list[str] | None) -> dict[str, str]:
     return found
 
 
+def refuse_conflicts(*conflicts: tuple[object, str | None, str]) -> None:
+    """Check options that cannot be combined: for each conflict, whether it is there, an option, and a message.
+
+    Raises:
+        typer.BadParameter: there is a conflict.
+    """
+    for found, option, message in conflicts:
+        if found:
+            raise typer.BadParameter(message, param_hint=option)
+
+
 def named_values(given: Iterable[str] | None, form: str, option: str) -> dict[str, str]:
     """Return the values by name of texts of the form NAME=VALUE.
 

@@ -156,15 +156,13 @@ def view(
         from jawusd.pipeline.view import is_capture
 
         capture = is_capture(rig)
-    if tracks is not None and not capture:
-        raise typer.BadParameter("--tracks needs a capture, not a rig.")
-    if prim is not None and capture:
-        raise typer.BadParameter("--prim needs a rig, not a capture.")
-    if footage and page is None:
-        raise typer.BadParameter("--footage needs --page; the viewer always shows footage.")
+    options.refuse_conflicts(
+        (tracks is not None and not capture, None, "--tracks needs a capture, not a rig."),
+        (prim is not None and capture, None, "--prim needs a rig, not a capture."),
+        (footage and page is None, None, "--footage needs --page; the viewer always shows footage."),
+        (page is not None and capture, None, "--page needs a rig, not a capture."),
+    )
     if page is not None:
-        if capture:
-            raise typer.BadParameter("--page needs a rig, not a capture.")
         from jawusd.pipeline.pose_page import write_page
 
         refuse_existing(page, force)

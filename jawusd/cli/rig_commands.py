@@ -57,7 +57,13 @@ def info(
 ) -> None:
     """Describe a rig file or tracks."""
     if schema:
-        _print_schema(as_json)
+        folder = str(schema_folder() or "")
+        lines = [
+            f"JawRigAPI: {folder or 'not installed'}",
+            f"other programs find it by {VARIABLE}={folder}",
+            "`import jawusd` registers it, before the first stage of a process is opened",
+        ]
+        emit({"schema": "JawRigAPI", "folder": folder, "variable": VARIABLE}, as_json, lines)
         return
     if rig is None:
         raise typer.BadParameter("give a rig file or tracks, or --schema.", param_hint="RIG")
@@ -81,16 +87,6 @@ def info(
     whole = {**found, "verdict": verdict, "changed": [finding.as_json() for finding in changed]}
     first = [] if verdict is None else [verdict]
     emit(whole, as_json, [*first, *_info_lines(found), *(finding.line() for finding in changed)])
-
-
-def _print_schema(as_json: bool) -> None:
-    folder = str(schema_folder() or "")
-    lines = [
-        f"JawRigAPI: {folder or 'not installed'}",
-        f"other programs find it by {VARIABLE}={folder}",
-        "`import jawusd` registers it, before the first stage of a process is opened",
-    ]
-    emit({"schema": "JawRigAPI", "folder": folder, "variable": VARIABLE}, as_json, lines)
 
 
 def _info_lines(found: Description) -> list[str]:

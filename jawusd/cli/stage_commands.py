@@ -67,19 +67,16 @@ def encode(
         frames, T = read_pose_table(poses)
         d, residual_mm = loaded.encode(T)
     known = np.isfinite(d).all(1)
-    margin_mm = loaded.margin(d)
-    values = np.column_stack([d, residual_mm, margin_mm])
+    values = np.column_stack([d, residual_mm, loaded.margin(d)])
     write_table(out, ("frame", *PARAMETER_COLUMNS, "residual_mm", "margin_mm"), frames[known], values[known])
-    residual = residual_mm[known]
-    size = {
-        "mean": float(residual.mean()) if residual.size else None,
-        "max": float(residual.max()) if residual.size else None,
-    }
+    head = f"{out}: {int(known.sum())} of {len(d)} poses"
+    size: dict[str, float | None] = {"mean": None, "max": None}
+    if known.any():
+        mean, largest = float(residual_mm[known].mean()), float(residual_mm[known].max())
+        size = {"mean": mean, "max": largest}
+        head += f", {mean:.3f} mm from the model on average, {largest:.3f} mm at most"
     judged = judged_motion(loaded, frames, d, residual_mm)
     result = {**judged, "file": str(out), "poses": len(d), "encoded": int(known.sum()), "residual_mm": size}
-    head = f"{out}: {result['encoded']} of {len(d)} poses"
-    if residual.size:
-        head += f", {residual.mean():.3f} mm from the model on average, {residual.max():.3f} mm at most"
     still = still_lines(judged["moved_mm"], len(d)) if holds_stage(poses) else []
     emit(result, as_json, [head, *judged_lines(judged)[1:], *still])
 
@@ -223,7 +220,13 @@ def rebake(
     shot = stage or rig
     out = out or shot.with_name(f"{shot.stem}_baked.usdc")
     refuse_existing(out, force)
-    taken = [_bake_rig(rig, shot, one, mandible, skull, origin) for one in _rigs_of(rig, stage, prim)]
+    taken = []
+    for path in _rigs_of(rig, stage, prim):
+        loaded = options.load_named(rig, path, shot)
+        found = read_stage_motion(loaded, rig, shot, path, mandible, skull, origin)
+        motion, changes = kept_inside(loaded, AuthoredMotion(found.frames, found.d, found.fps))
+        judged = judged_motion(loaded, found.frames, found.d, found.residual_mm)
+        taken.append(_BakedRig(loaded, found, motion, changes, judged))
     stronger = _write_baked(out, rig, shot, taken, root, prim[0] if prim else None)
     actors = [{"prim": one.found.prim, "from": one.found.origin, **one.judged, **one.changes.figures} for one in taken]
     result = {"file": str(out), **(actors[0] if len(actors) == 1 else {}), "actors": actors, "stronger": stronger}
@@ -254,20 +257,6 @@ def _rigs_of(rig: Path, stage: Path | None, prims: list[str] | None) -> list[str
 
     opened = open_stage(rig)
     return [str(prim.GetPath()) for prim in rig_prims(opened)] or [str(find_rig_prim(opened, rig).GetPath())]
-
-
-def _bake_rig(
-    rig: Path,
-    shot: Path,
-    prim: str | None,
-    mandible: str | None,
-    skull: str | None,
-    origin: Origin | None,
-) -> _BakedRig:
-    loaded = options.load_named(rig, prim, shot)
-    found = read_stage_motion(loaded, rig, shot, prim, mandible, skull, origin)
-    motion, changes = kept_inside(loaded, AuthoredMotion(found.frames, found.d, found.fps))
-    return _BakedRig(loaded, found, motion, changes, judged_motion(loaded, found.frames, found.d, found.residual_mm))
 
 
 def _write_baked(
