@@ -150,18 +150,11 @@ def sync(
 ) -> None:
     """Estimate the frame offsets between cameras from light flashes or, without flashes, from sound."""
     from jawusd.cli.text_capture import sync_lines
-    from jawusd.pipeline.calibrate import (
-        PLOT_SUFFIXES,
-        light_curves,
-        sync_cameras,
-        sync_videos,
-        write_light_curves,
-        write_sync_plot,
-    )
+    from jawusd.pipeline import calibrate as stage
     from jawusd.pipeline.workspace import open_capture
 
-    if plot is not None and plot.suffix.lower() not in PLOT_SUFFIXES:
-        raise typer.BadParameter(f"--plot {plot} must end in {' or '.join(PLOT_SUFFIXES)}.")
+    if plot is not None and plot.suffix.lower() not in stage.PLOT_SUFFIXES:
+        raise typer.BadParameter(f"--plot {plot} must end in {' or '.join(stage.PLOT_SUFFIXES)}.")
     refuse_any(force, curves, plot)
     single = len(clips) == 1
     if single and reference is not None:
@@ -174,16 +167,16 @@ def sync(
     with progress() as report:
         try:
             if capture is not None:
-                result = sync_cameras(capture, report)
+                result = stage.sync_cameras(capture, report)
             else:
-                result = sync_videos(videos, reference or next(iter(videos)), report)
+                result = stage.sync_videos(videos, reference or next(iter(videos)), report)
         except SyncError as error:
             failure = error  # raised after the curves are written, because they show why alignment failed
-        found = light_curves(videos, report) if curves is not None or plot is not None else {}
+        found = stage.light_curves(videos, report) if curves is not None or plot is not None else {}
         if curves is not None:
-            write_light_curves(curves, found)
+            stage.write_light_curves(curves, found)
         if plot is not None:
-            write_sync_plot(plot, found, result)
+            stage.write_sync_plot(plot, found, result)
     if result is None:
         raise failure or SyncError("the cameras could not be aligned")
     emit(result, as_json, sync_lines(result))

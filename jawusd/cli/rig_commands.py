@@ -15,15 +15,7 @@ from numpy.typing import NDArray
 import jawusd
 from jawusd.base.arrays import Array
 from jawusd.base.plugin_path import VARIABLE, schema_folder
-from jawusd.cli import options
-from jawusd.cli.face_commands import (
-    AlignOption,
-    CsvOption,
-    FaceOption,
-    MappingOption,
-    StripOption,
-    judge_face,
-)
+from jawusd.cli import face_commands, options
 from jawusd.cli.motion import read_pose_table
 from jawusd.cli.output import emit, refuse_any
 from jawusd.cli.text_build import contact_words, frame_lines, joint_words, track_lines
@@ -176,11 +168,11 @@ def validate(
             min=0.0, help="Allowed distance outside the bound [mm]; 0 for authored poses. Default: set by the rig."
         ),
     ] = None,
-    face: FaceOption = None,
-    align: AlignOption = None,
-    mapping: MappingOption = None,
-    csv: CsvOption = None,
-    strip: StripOption = None,
+    face: face_commands.FaceOption = None,
+    align: face_commands.AlignOption = None,
+    mapping: face_commands.MappingOption = None,
+    csv: face_commands.CsvOption = None,
+    strip: face_commands.StripOption = None,
     force: options.Force = False,
     prim: options.Prim = None,
     allow: options.Allow = None,
@@ -195,7 +187,7 @@ def validate(
         if poses is not None:
             raise typer.BadParameter("give either poses or --face.", param_hint="--face")
         refuse_any(force, csv, strip)
-        judged = judge_face(jawusd.load(rig, prim=prim), face, align, mapping, residual_mm, tolerance_mm)
+        judged = face_commands.judge_face(jawusd.load(rig, prim=prim), face, align, mapping, residual_mm, tolerance_mm)
         if csv is not None:
             from jawusd.fitting.face_judging import save_verdicts
 
