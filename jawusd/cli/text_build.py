@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from jawusd.pipeline.track import FrameTrackSummary, TrackSummary
 
 
+_CALIBRATED = "the capture names no calibration: one was made from its boards"
 _MOST_FURTHER = 3  # maximum number of further recommendations that a build prints; the report lists all
 
 
@@ -63,7 +64,7 @@ def _findings(summary: BuildSummary) -> tuple[list[str], list[str]]:
 def _key_lines(summary: BuildSummary) -> list[str]:
     track, fit = summary["track"], summary["fit"]
     sigma_mm = {name: value for name, value in track["sigma_mm"].items() if value is not None}
-    lines = ["the capture names no calibration: one was made from its boards"] if summary["calibrate"] else []
+    lines = [_CALIBRATED] if summary["calibrate"] else []
     lines += [_sync_line(summary), f"tracked {track['tracked']} of {track['frames']} frames"]
     if "incisor" in sigma_mm:
         lines[-1] += f", expected error at the incisor {sigma_mm['incisor']:.2f} mm"
@@ -76,7 +77,7 @@ def _key_lines(summary: BuildSummary) -> list[str]:
                 f"{errors['max']:.2f} mm at most"
             )
             break
-    told = [*_findings(summary)[0], *_findings(summary)[1]]
+    told = (line for lines in _findings(summary) for line in lines)
     warned = sum(line.startswith("warning") for line in told) + len(fit.get("warnings", []))
     if warned:
         lines.append(f"{warned} warning{'s' if warned > 1 else ''}: see the report, or add -v")
@@ -87,10 +88,7 @@ def _key_lines(summary: BuildSummary) -> list[str]:
 def _stage_lines(summary: BuildSummary) -> list[str]:
     lines = _findings(summary)[0]
     if summary["calibrate"]:
-        lines += [
-            "the capture names no calibration: one was made from its boards",
-            *calibration_lines(summary["calibrate"]),
-        ]
+        lines += [_CALIBRATED, *calibration_lines(summary["calibrate"])]
     lines += [_sync_line(summary), *(f"  note: {note}" for note in summary["sync"].get("notes", []))]
     lines += [*track_lines(summary["track"]), *fit_lines(summary["fit"])]
     seconds = ", ".join(
@@ -102,15 +100,11 @@ def _stage_lines(summary: BuildSummary) -> list[str]:
 
 def plan_lines(stages: list[PlannedStage]) -> list[str]:
     """Return a plan as text."""
-    lines = [
-        f"  {stage.name:10} {'kept' if stage.keeps else 'runs, about ' + rounded_duration(stage.seconds)}"
-        for stage in stages
-    ]
+    ends = ["kept" if stage.keeps else f"runs, about {rounded_duration(stage.seconds)}" for stage in stages]
+    lines = [f"  {stage.name:10} {end}" for stage, end in zip(stages, ends, strict=True)]
     total = sum(stage.seconds for stage in stages if not stage.keeps)
-    return [
-        *lines,
-        f"about {rounded_duration(total)} in all on one core; nothing was written" if total else "nothing to do",
-    ]
+    whole = f"about {rounded_duration(total)} in all on one core; nothing was written" if total else "nothing to do"
+    return [*lines, whole]
 
 
 def rounded_duration(seconds: float) -> str:
@@ -184,12 +178,9 @@ def _take_lines(summary: TrackSummary) -> list[str]:
     if "registration" in summary:
         bite = summary["registration"]
         shift, turn, *sigmas = registration_sizes(bite)
-        what = (
-            "lower scan moved to the closed bite by"
-            if bite["applied"]
-            else "lower scan deviates from the closed bite by"
-        )
-        lines.append(f"  {what} {shift:.2f} +- {sigmas[0]:.2f} mm, {turn:.2f} +- {sigmas[1]:.2f} degrees")
+        what = "moved to" if bite["applied"] else "deviates from"
+        size = f"{shift:.2f} +- {sigmas[0]:.2f} mm, {turn:.2f} +- {sigmas[1]:.2f} degrees"
+        lines.append(f"  lower scan {what} the closed bite by {size}")
     return lines
 
 
@@ -244,13 +235,10 @@ def joint_words(joints: object) -> str:
     closed, error, limit = (found.get(name) for name in ("closed_mm", "error_mm", "limit_mm"))
     if not isinstance(closed, float) or not isinstance(error, float) or not isinstance(limit, float):
         return f"clearance from the skull is unknown: {found.get('missing', 'not measured')}"
-    where = (
-        f"{closed:.2f} mm inside the bone of the skull"
-        if closed > 0
-        else f"{-closed:.2f} mm from the bone of the skull"
-    )
+    where = f"{closed:.2f} mm inside" if closed > 0 else f"{-closed:.2f} mm from"
     if closed <= -_FARTHEST_MM:
-        where = f"more than {_FARTHEST_MM:g} mm from the bone of the skull"
+        where = f"more than {_FARTHEST_MM:g} mm from"
+    where += " the bone of the skull"
     if error == 0.0:  # no surface of the skull is near enough to be measured
         return f"{where} in occlusion, and not within {NEAR_MM:g} mm of it anywhere inside the bound"
     deeper = f"up to {-limit:.2f} mm into it in captured poses; " if limit < -AUTHORED_MM else ""

@@ -96,8 +96,8 @@ def scans_lines(summary: ScansSummary) -> list[str]:
             (scan["empty_faces"], "empty faces"),
             (scan["repeated_faces"], "duplicate faces"),
         )
-        found = [f"{count} {what}" for count, what in cleaned if count]
-        lines += [f"  {', '.join(found)}"] if found else []
+        if found := [f"{count} {what}" for count, what in cleaned if count]:
+            lines.append(f"  {', '.join(found)}")
         if scan["labels_file"]:
             lines.append(f"  labels: {scan['labels_file']}")
         lines += [f"  {Finding.from_json(finding).line()}" for finding in scan["findings"]]
@@ -108,13 +108,9 @@ def start_lines(start: CaptureStart) -> list[str]:
     """Return what was found for a draft capture, and what is missing, as text."""
     folder = start.path.parent
     lines = [f"{start.path}", *(f"  {line}" for line in start.found), *(f"note: {line}." for line in start.notes)]
-    if start.missing:
-        return [
-            *lines,
-            *(f"missing: {line}." for line in start.missing),
-            f"Fill in {start.path}, then: jawusd check {folder}",
-        ]
-    return [*lines, f"next: jawusd check {folder}"]
+    lines += [f"missing: {line}." for line in start.missing]
+    before = f"Fill in {start.path}, then" if start.missing else "next"
+    return [*lines, f"{before}: jawusd check {folder}"]
 
 
 _LEAST_APART_MM = 10.0  # minimum extent of the camera positions; `capture.camera_checks` rejects captures below it
