@@ -8,8 +8,13 @@ from __future__ import annotations
 import contextlib
 import re
 from collections.abc import Callable, Iterator
-from functools import partial
+from functools import partial, wraps
 from os import PathLike
+from typing import Concatenate, ParamSpec, TypeVar
+
+_Path = TypeVar("_Path", bound=str | PathLike[str])
+_Rest = ParamSpec("_Rest")
+_Read = TypeVar("_Read")
 
 _OF_BUILD = "PIL av cv2 jinja2 matplotlib numba onnx onnxruntime pyfqmr scipy shapely torch trimesh"
 _EXTRA_OF_PACKAGE = {
@@ -176,6 +181,17 @@ def naming_file(path: str | PathLike[str]) -> Iterator[None]:
         if error.path is None:
             error.path = str(path)
         raise
+
+
+def errors_name_file(read: Callable[Concatenate[_Path, _Rest], _Read]) -> Callable[Concatenate[_Path, _Rest], _Read]:
+    """Decorate a function of a file, its first argument: errors without a path get that of the file."""
+
+    @wraps(read)
+    def named(path: _Path, *args: _Rest.args, **options: _Rest.kwargs) -> _Read:
+        with naming_file(path):
+            return read(path, *args, **options)
+
+    return named
 
 
 @contextlib.contextmanager

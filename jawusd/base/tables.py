@@ -25,7 +25,7 @@ from pathlib import Path
 import numpy as np
 
 from jawusd.base.arrays import Array
-from jawusd.base.errors import FormatError
+from jawusd.base.errors import FormatError, errors_name_file
 from jawusd.base.inputs import check_input
 
 SEPARATORS = {"\t": "tabs", ";": "semicolons", ",": "commas"}
@@ -35,6 +35,7 @@ _COMMA_NUMBER = re.compile(r"[+-]?\d*,\d*(e[+-]?\d+)?", re.IGNORECASE)
 _MAYBE_THOUSANDS = re.compile(r"[+-]?[1-9]\d{0,2},\d{3}")
 
 
+@errors_name_file
 def read_text(path: Path, most_bytes: int, encoding: str = "utf-8") -> str:
     """Return the content of a text file of at most `most_bytes`, with LF line ends.
 
@@ -47,28 +48,27 @@ def read_text(path: Path, most_bytes: int, encoding: str = "utf-8") -> str:
     try:
         size = path.stat().st_size
         if size > most_bytes:
-            raise FormatError(f"is {size} bytes long; at most {most_bytes} bytes are allowed.", path=path)
+            raise FormatError(f"is {size} bytes long; at most {most_bytes} bytes are allowed.")
         data = path.read_bytes()
     except FileNotFoundError as error:
-        raise FormatError("there is no such file.", path=path, hint="Check the path.") from error
+        raise FormatError("there is no such file.", hint="Check the path.") from error
     except OSError as error:
-        raise FormatError(f"cannot be read: {error.strerror}.", path=path) from error
+        raise FormatError(f"cannot be read: {error.strerror}.") from error
     found = json.detect_encoding(data)
     try:
         text = data.decode(encoding if found == "utf-8" else found)
     except UnicodeDecodeError as error:
-        raise _not_text(path, error, found) from error
+        raise _not_text(error, found) from error
     return text.replace("\r\n", "\n").replace("\r", "\n")
 
 
-def _not_text(path: Path, error: UnicodeDecodeError, encoding: str) -> FormatError:
+def _not_text(error: UnicodeDecodeError, encoding: str) -> FormatError:
     if not encoding.startswith("utf-8"):
         words = f"begins as {encoding.upper()} text but has bytes that are invalid in it."
-        return FormatError(words, path=path, hint=_AS_UTF8)
+        return FormatError(words, hint=_AS_UTF8)
     line, byte = error.object[: error.start].count(b"\n") + 1, error.object[error.start]
     return FormatError(
         f"is not UTF-8 text: line {line} has the byte 0x{byte:02x}, probably an accented letter in another encoding.",
-        path=path,
         hint=_AS_UTF8,
     )
 
@@ -77,7 +77,6 @@ def _not_text(path: Path, error: UnicodeDecodeError, encoding: str) -> FormatErr
 class TextTable:
     """A table with a header, cells as text."""
 
-    path: Path  # the file, for messages
     header: list[str]  # column names, without blank ones at the end
     rows: list[list[str]]  # cells, one per column
     places: list[str]  # place of each row in the file, such as "line 3"
@@ -90,13 +89,14 @@ class TextTable:
         """
         chosen = range(len(self.rows)) if rows is None else rows
         cells = [[self.rows[i][k] for k in columns] for i in chosen]
-        return to_numbers(cells, lambda i, j: self.named(chosen[i], columns[j]), self.path).reshape(-1, len(columns))
+        return to_numbers(cells, lambda i, j: self.named(chosen[i], columns[j])).reshape(-1, len(columns))
 
     def named(self, row: int, column: int) -> str:
         """Return the name of a cell for messages."""
         return f'{self.places[row]}, column "{self.header[column]}"'
 
 
+@errors_name_file
 def read_table(path: Path, most_bytes: int, comment: str = "#", short_rows: bool = False) -> TextTable:
     """Read a text table whose first row names the columns.
 
@@ -108,13 +108,13 @@ def read_table(path: Path, most_bytes: int, comment: str = "#", short_rows: bool
     Raises:
         FormatError: the file is not text or not a table, or a row has more or fewer cells than the header.
     """
-    found, separator = split_rows(read_text(path, most_bytes), path, comment)
+    found, separator = split_rows(read_text(path, most_bytes), comment)
     if not found:
-        raise FormatError("is empty; the first line must name the columns.", path=path)
+        raise FormatError("is empty; the first line must name the columns.")
     header = [name.strip() for name in found[0][1]]
     while header and not header[-1]:
         header.pop()
-    table = TextTable(path, header, [], [])
+    table = TextTable(header, [], [])
     for line, row in found[1:]:
         while len(row) > len(header) and not row[-1].strip():
             row.pop()
@@ -136,14 +136,11 @@ def check_width(table: TextTable, index: int, separator: str = "") -> None:
         more = separator == "," and found > wanted
         raise FormatError(
             f"{table.places[index]} has {found} values, but the header has {wanted} columns.",
-            path=table.path,
             hint="Commas separate the columns here: write decimals with points." if more else "Correct that line.",
         )
 
 
-def split_rows(
-    text: str, path: Path, comment: str = "#", blank_rows: bool = False
-) -> tuple[list[tuple[int, list[str]]], str]:
+def split_rows(text: str, comment: str = "#", blank_rows: bool = False) -> tuple[list[tuple[int, list[str]]], str]:
     """Return the rows of a table with their line numbers, and the separator.
 
     Args:
@@ -160,7 +157,7 @@ def split_rows(
         reader = csv.reader(io.StringIO(text[named.end() :] if named else text), delimiter=separator, strict=True)
         rows = [(reader.line_num + above, row) for row in reader if blank_rows and len(row) > 1 or _is_filled(row)]
     except csv.Error as error:
-        raise FormatError(f"is not a CSV table ({error}).", path=path) from error
+        raise FormatError(f"is not a CSV table ({error}).") from error
     while rows and not _is_filled(rows[-1][1]):
         rows.pop()
     return [(line, row) for line, row in rows if not row[0].lstrip().startswith(comment)], separator
@@ -181,7 +178,7 @@ def _separator(text: str, comment: str) -> str:
     return (alike or splitting or [","])[0]
 
 
-def to_numbers(cells: Sequence[Sequence[str]], named: Callable[[int, int], str], path: Path) -> Array:
+def to_numbers(cells: Sequence[Sequence[str]], named: Callable[[int, int], str]) -> Array:
     """Return cells, in rows of equal length, as an array of numbers; `nan` and `inf` are kept.
 
     `named` returns the name of a cell for messages, given row and column.
@@ -190,14 +187,14 @@ def to_numbers(cells: Sequence[Sequence[str]], named: Callable[[int, int], str],
         FormatError: a cell is not a number, or the decimal separator is ambiguous.
     """
     if any("," in cell for row in cells for cell in row):
-        cells = _with_points(cells, named, path)
+        cells = _with_points(cells, named)
     try:
         return np.array(cells, dtype=np.float64)
     except ValueError as error:
         for i, row in enumerate(cells):
             for j, cell in enumerate(row):
                 if not is_number(cell):
-                    raise FormatError(f'{named(i, j)}: "{cell:.80}" is not a number.', path=path) from error
+                    raise FormatError(f'{named(i, j)}: "{cell:.80}" is not a number.') from error
         raise
 
 
@@ -210,7 +207,7 @@ def is_number(cell: str) -> bool:
     return True
 
 
-def _with_points(cells: Sequence[Sequence[str]], named: Callable[[int, int], str], path: Path) -> list[list[str]]:
+def _with_points(cells: Sequence[Sequence[str]], named: Callable[[int, int], str]) -> list[list[str]]:
     """Return the cells with decimal commas replaced by points."""
     flat = [(i, j, cell.strip()) for i, row in enumerate(cells) for j, cell in enumerate(row)]
     commas = [place for place in flat if "," in place[2]]
@@ -220,13 +217,11 @@ def _with_points(cells: Sequence[Sequence[str]], named: Callable[[int, int], str
         raise FormatError(
             f'{named(i, j)} is "{cell}" and {named(*point[:2])} is "{point[2]}": commas and points cannot both be '
             "decimal separators, and thousands separators are not allowed.",
-            path=path,
             hint="Write all decimals with points, without thousands separators.",
         )
     if all(_MAYBE_THOUSANDS.fullmatch(cell) for _, _, cell in commas):
         raise FormatError(
             f'{named(i, j)}: "{cell}" is ambiguous: {cell.replace(",", ".")} or {cell.replace(",", "")}.',
-            path=path,
             hint="Write decimals with points, without thousands separators.",
         )
     return [

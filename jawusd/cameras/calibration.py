@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from jawusd.base.arrays import Array
-from jawusd.base.errors import CalibrationError
+from jawusd.base.errors import CalibrationError, errors_name_file
 from jawusd.cameras.files import CameraFormat, Size, check_lens_model
 from jawusd.formats.atomic import write_text_atomic
 from jawusd.formats.text import read_toml
@@ -38,6 +38,7 @@ _INSTEAD = "Export the cameras for Nuke (.nk, from 3DEqualizer) or as USD; `jawu
 _CAMERA_TABLE = re.compile(r"^cam_\d+$")
 
 
+@errors_name_file
 def load_calibration(path: str | os.PathLike[str]) -> list[Camera]:
     """Read the cameras of a calibration file.
 
@@ -54,46 +55,42 @@ def load_calibration(path: str | os.PathLike[str]) -> list[Camera]:
             data = {f"cam_{port}": table for port, table in below.items()}
         tables = [key for key, table in data.items() if isinstance(table, dict) and "matrix" in table]
     if not tables:
-        raise CalibrationError('has no camera tables such as "[cam_0]", "[cam_1]".', path=path)
-    cameras = [_camera(path, table, data[table]) for table in tables]
+        raise CalibrationError('has no camera tables such as "[cam_0]", "[cam_1]".')
+    cameras = [_camera(table, data[table]) for table in tables]
     names = [camera.name for camera in cameras]
     if len(set(names)) != len(names):
-        raise CalibrationError(f"has cameras with the same name; the names are {', '.join(names)}.", path=path)
+        raise CalibrationError(f"has cameras with the same name; the names are {', '.join(names)}.")
     return cameras
 
 
-def _numbers(path: Path, table: str, values: dict[str, object], key: str, shapes: tuple[tuple[int, ...], ...]) -> Array:
+def _numbers(table: str, values: dict[str, object], key: str, shapes: tuple[tuple[int, ...], ...]) -> Array:
     if key not in values:
-        raise CalibrationError(f'[{table}] has no "{key}".', path=path)
+        raise CalibrationError(f'[{table}] has no "{key}".')
     try:
         array = np.array(values[key], dtype=np.float64)
     except (ValueError, TypeError, OverflowError) as error:
-        raise CalibrationError(f'[{table}] "{key}" is not an array of numbers.', path=path) from error
+        raise CalibrationError(f'[{table}] "{key}" is not an array of numbers.') from error
     if array.shape not in shapes:
         allowed = " or ".join(str(s) for s in shapes)
-        raise CalibrationError(f'[{table}] "{key}" has shape {array.shape}; expected {allowed}.', path=path)
+        raise CalibrationError(f'[{table}] "{key}" has shape {array.shape}; expected {allowed}.')
     if not np.isfinite(array).all():
-        raise CalibrationError(f'[{table}] "{key}" has a value that is not finite.', path=path)
+        raise CalibrationError(f'[{table}] "{key}" has a value that is not finite.')
     return array
 
 
-def _camera(path: Path, table: str, values: object) -> Camera:
+def _camera(table: str, values: object) -> Camera:
     if not isinstance(values, dict):
-        raise CalibrationError(f"[{table}] must be a table.", path=path)
-    size = _numbers(path, table, values, "size", ((2,),))
-    K = _numbers(path, table, values, "matrix", ((3, 3),))
-    distortion = _numbers(path, table, values, "distortions", ((0,), (4,), (5,), (8,)))
-    rotation = _numbers(path, table, values, "rotation", ((3,), (3, 3)))
-    translation = _numbers(path, table, values, "translation", ((3,),))
-    check_lens_model(path, f"[{table}]", values)
+        raise CalibrationError(f"[{table}] must be a table.")
+    size = _numbers(table, values, "size", ((2,),))
+    K = _numbers(table, values, "matrix", ((3, 3),))
+    distortion = _numbers(table, values, "distortions", ((0,), (4,), (5,), (8,)))
+    rotation = _numbers(table, values, "rotation", ((3,), (3, 3)))
+    translation = _numbers(table, values, "translation", ((3,),))
+    check_lens_model(f"[{table}]", values)
     if (size < 16).any() or (size != np.round(size)).any():
-        raise CalibrationError(
-            f"[{table}] size is {size.tolist()} px; expected two whole numbers of at least 16 px.", path=path
-        )
+        raise CalibrationError(f"[{table}] size is {size.tolist()} px; expected two whole numbers of at least 16 px.")
     if K[0, 0] <= 0 or K[1, 1] <= 0 or np.abs(K[[1, 2, 2], [0, 0, 1]]).max() > 0 or K[2, 2] != 1:
-        raise CalibrationError(
-            f"[{table}] matrix must be [[fx, s, cx], [0, fy, cy], [0, 0, 1]] with fx, fy > 0 px.", path=path
-        )
+        raise CalibrationError(f"[{table}] matrix must be [[fx, s, cx], [0, fy, cy], [0, 0, 1]] with fx, fy > 0 px.")
     if rotation.ndim == 1:
         rotation = so3_exp(rotation)
     defect = float(rigidity_defect(make_transform(rotation, np.zeros(3))))
@@ -101,7 +98,6 @@ def _camera(path: Path, table: str, values: object) -> Camera:
         raise CalibrationError(
             f"[{table}] rotation is not orthonormal: R R^T - I is up to {defect:.2g}; at most "
             f"{_ROTATION_TOLERANCE:g} is allowed.",
-            path=path,
             hint="Write the Rodrigues vector of a proper rotation, world to camera.",
         )
     # A rotation written with few digits is only approximately orthonormal.
@@ -118,16 +114,14 @@ def save_calibration(path: str | os.PathLike[str], cameras: list[Camera]) -> Non
     """
     lines = []
     for index, camera in enumerate(cameras):
-        matrix = ", ".join("[" + ", ".join(repr(float(v)) for v in row) + "]" for row in camera.K)
-        rotation = so3_log(camera.T_cam_world[:3, :3])
         lines += [
             f"[cam_{index}]",
             f'name = "{camera.name}"',
             f"size = [{camera.size_px[0]}, {camera.size_px[1]}]",
-            f"matrix = [{matrix}]",
-            f"distortions = {[float(v) for v in camera.distortion]}",
-            f"rotation = {[float(v) for v in rotation]}",
-            f"translation = {[float(v) for v in camera.T_cam_world[:3, 3]]}",
+            f"matrix = {camera.K.tolist()}",
+            f"distortions = {camera.distortion.tolist()}",
+            f"rotation = {so3_log(camera.T_cam_world[:3, :3]).tolist()}",
+            f"translation = {camera.T_cam_world[:3, 3].tolist()}",
             "",
         ]
     write_text_atomic(path, "\n".join([*lines, "[metadata]", 'units = "mm"', ""]))
@@ -135,10 +129,10 @@ def save_calibration(path: str | os.PathLike[str], cameras: list[Camera]) -> Non
 
 def _load(path: Path, _: Mapping[str, Size]) -> list[Camera]:
     if path.is_dir():
-        raise CalibrationError("is a folder without cameras in a supported format.", path=path, hint=_INSTEAD)
+        raise CalibrationError("is a folder without cameras in a supported format.", hint=_INSTEAD)
     if path.suffix.lower() in _NOT_READ:
         what = _NOT_READ[path.suffix.lower()]
-        raise CalibrationError(f"is a file of {what}; this format is not supported.", path=path, hint=_INSTEAD)
+        raise CalibrationError(f"is a file of {what}; this format is not supported.", hint=_INSTEAD)
     return load_calibration(path)
 
 

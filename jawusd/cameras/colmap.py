@@ -7,7 +7,6 @@ translation from world to camera, and the image's points, which may be omitted. 
 
 from __future__ import annotations
 
-import os
 import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -15,9 +14,18 @@ from pathlib import Path
 import numpy as np
 
 from jawusd.base.arrays import Array
-from jawusd.base.errors import CalibrationError, FormatError
+from jawusd.base.errors import CalibrationError, FormatError, errors_name_file, naming_file
 from jawusd.base.tables import is_number, read_text
-from jawusd.cameras.files import MOST_BYTES, CameraFormat, cameras_of_images, corner_matrix, files_in, numbers
+from jawusd.cameras.files import (
+    MOST_BYTES,
+    CameraFormat,
+    Size,
+    cameras_of_images,
+    corner_matrix,
+    files_in,
+    folder_of,
+    numbers,
+)
 from jawusd.formats.atomic import write_text_atomic
 from jawusd.geometry import Camera, make_transform, matrix_from_wxyz, wxyz_from_matrix
 
@@ -37,7 +45,7 @@ _POINTS = re.compile(r"(?:\S+ \S+ -?\d+(?: |$))+")
 _LARGEST_SKEW = 1e-9
 
 
-def load_colmap(folder: str | os.PathLike[str]) -> list[Camera]:
+def load_colmap(folder: Path) -> list[Camera]:
     """Read a COLMAP text model; return the cameras sorted by name, in the model's unit.
 
     All images of a camera must have the same pose and lens, since cameras of a capture are static.
@@ -45,29 +53,26 @@ def load_colmap(folder: str | os.PathLike[str]) -> list[Camera]:
     Raises:
         CalibrationError: a file is missing, a value is missing or wrong, or the camera model is not supported.
     """
-    folder = Path(folder)
+    lenses = _lenses(folder / "cameras.txt")
     path = folder / "images.txt"
-    lenses = {row[0]: _lens(folder / "cameras.txt", row) for row in _rows(folder / "cameras.txt") if row}
-    images: list[tuple[str, Camera]] = []
-    for row in _image_rows(path):
-        if row[8] not in lenses:
-            raise CalibrationError(f"image {row[9]} refers to camera {row[8]}, which is not in cameras.txt.", path=path)
-        q, t = np.split(numbers(path, " ".join(row[1:8]), 7, f"image {row[9]}"), [4])
-        if not np.linalg.norm(q) > 0:
-            raise CalibrationError(f"image {row[9]} has a zero quaternion.", path=path)
-        size, K, distortion = lenses[row[8]]
-        file = " ".join(row[9:])
-        images.append((file, Camera(file, size, K, distortion, make_transform(matrix_from_wxyz(q), t))))
-    if not images:
-        raise CalibrationError("has no images.", path=path)
-    counted = _COUNTED.search(read_text(path, MOST_BYTES))
-    if counted is not None and int(counted[1]) > len(images):
-        raise CalibrationError(
-            f"is truncated: it has {len(images)} of the {counted[1]} images in its header.",
-            path=path,
-            hint='Export the model again; if images were removed by hand, correct "# Number of images".',
-        )
-    return cameras_of_images(path, images)
+    images = []
+    with naming_file(path):
+        for row in _image_rows(path):
+            if row[8] not in lenses:
+                raise CalibrationError(f"image {row[9]} refers to camera {row[8]}, which is not in cameras.txt.")
+            q, t = np.split(numbers(" ".join(row[1:8]), 7, f"image {row[9]}"), [4])
+            if not np.linalg.norm(q) > 0:
+                raise CalibrationError(f"image {row[9]} has a zero quaternion.")
+            images.append(Camera(" ".join(row[9:]), *lenses[row[8]], make_transform(matrix_from_wxyz(q), t)))
+        if not images:
+            raise CalibrationError("has no images.")
+        counted = _COUNTED.search(read_text(path, MOST_BYTES))
+        if counted is not None and int(counted[1]) > len(images):
+            raise CalibrationError(
+                f"is truncated: it has {len(images)} of the {counted[1]} images in its header.",
+                hint='Export the model again; if images were removed by hand, correct "# Number of images".',
+            )
+        return cameras_of_images(images)
 
 
 def _image_rows(path: Path) -> Iterator[list[str]]:
@@ -80,8 +85,7 @@ def _image_rows(path: Path) -> Iterator[list[str]]:
             continue
         if len(row) < 10 or not all(is_number(word) for word in row[:9]):
             raise CalibrationError(
-                f'"{" ".join(row):.80}" is not an image line; expected ID, 4 + 3 pose values, camera ID and name.',
-                path=path,
+                f'"{" ".join(row):.80}" is not an image line; expected ID, 4 + 3 pose values, camera ID and name.'
             )
         after_image = True
         yield row
@@ -96,7 +100,6 @@ def _rows(path: Path) -> list[list[str]]:
         convert = "colmap model_converter --input_path . --output_path . --output_type TXT"
         raise CalibrationError(
             f"cannot be read ({error.message.rstrip('.')}).",
-            path=path,
             hint=f"This model is binary; convert it to text: {convert}"
             if binary
             else "A COLMAP text model has cameras.txt and images.txt.",
@@ -104,31 +107,36 @@ def _rows(path: Path) -> list[list[str]]:
     return [line.split() for line in text.split("\n") if not line.lstrip().startswith("#")]
 
 
-def _lens(path: Path, row: list[str]) -> tuple[tuple[int, int], Array, Array]:
+@errors_name_file
+def _lenses(path: Path) -> dict[str, tuple[Size, Array, Array]]:
+    """Return size, K (3, 3) and distortion of each camera by its ID."""
+    return {row[0]: _lens(row) for row in _rows(path) if row}
+
+
+def _lens(row: list[str]) -> tuple[Size, Array, Array]:
     if len(row) < 5 or row[1] not in _MODELS:
         found = row[1] if len(row) > 1 else "nothing"
         raise CalibrationError(
             f"camera {row[0]} has the model {found}; it must be one of {', '.join(_MODELS)}.",
-            path=path,
             hint="Undistort the footage first, or solve again with --ImageReader.camera_model OPENCV.",
         )
     focal, terms = _MODELS[row[1]]
     expected = 2 + (3 if focal == "f" else 4) + terms
-    values = numbers(path, " ".join(row[2:]), expected, f"camera {row[0]} of the model {row[1]}")
+    values = numbers(" ".join(row[2:]), expected, f"camera {row[0]} of the model {row[1]}")
     size = (int(values[0]), int(values[1]))
     fx, fy, cx, cy = (values[2], *values[2:5]) if focal == "f" else values[2:6]
     distortion = values[expected - terms :]
     if 0 < terms < 4:  # pad a model that has only radial terms
         distortion = np.concatenate([distortion, np.zeros(4 - terms)])
-    return size, corner_matrix(path, f"camera {row[0]}", fx, fy, cx, cy), distortion
+    return size, corner_matrix(f"camera {row[0]}", fx, fy, cx, cy), distortion
 
 
 FORMAT = CameraFormat(
     lambda path: (
         path.name in _FILES or any(file.stem in ("cameras", "images") for file in files_in(path, ".txt", ".bin"))
     ),
-    lambda path, _: load_colmap(path if path.is_dir() else path.parent),
-    lambda path: [(path if path.is_dir() else path.parent) / name for name in _FILES],
+    lambda path, _: load_colmap(folder_of(path)),
+    lambda path: [folder_of(path) / name for name in _FILES],
 )
 
 

@@ -22,7 +22,7 @@ from pathlib import Path
 import numpy as np
 
 from jawusd.base.arrays import Array
-from jawusd.base.errors import CalibrationError, FormatError
+from jawusd.base.errors import CalibrationError, FormatError, errors_name_file
 from jawusd.cameras.nuke_script import NukeNode, steady_values
 from jawusd.formats.text import read_text
 from jawusd.geometry.camera import opencv_lens
@@ -92,43 +92,40 @@ def find_lenses(folder: Path, scripts: Mapping[Path, list[NukeNode]]) -> list[Fo
     return out
 
 
+@errors_name_file
 def _node_lens(path: Path, node: NukeNode, name: str) -> Lens:
     """Return the lens of a Nuke LD node; its class names the distortion model, its knobs the parameters."""
     models = {_nuke_name(model): model for model in _PARAMETERS}
     model = models.get(node.kind.removeprefix("LD").lstrip("_"))
     if model is None:
-        raise _unread(path, node.kind)
+        raise _unread(node.kind)
 
     def value(knob: str, default: float) -> float:
-        return float(steady_values(path, node, knob, (default,))[0])
+        return float(steady_values(node, knob, (default,))[0])
 
     for side, whole in _FOV.items():
         if abs(value(f"field_of_view_{side}_unit", whole) - whole) > 1e-6:
             raise CalibrationError(
                 f"lens {node.name} has a field of view smaller or larger than the image (field_of_view_{side}_unit); "
                 "expected xa = 0, xb = 1, ya = 0, yb = 1.",
-                path=path,
                 hint="Set the camera's field of view to the whole image in 3DEqualizer.",
             )
-    sides = [f"tde4_filmback_{side}_cm" for side in ("width", "height")]
-    stated = all(side in node.knobs for side in sides)
-    return Lens(
-        name,
-        path,
-        (_MM_PER_CM * value(sides[0], 0), _MM_PER_CM * value(sides[1], 0)) if stated else None,
-        (
-            _MM_PER_CM * value("tde4_lens_center_offset_x_cm", 0),
-            _MM_PER_CM * value("tde4_lens_center_offset_y_cm", 0),
-        ),
-        model,
-        {key: value(_nuke_name(key), default) for key, default in _PARAMETERS[model].items()},
-    )
+
+    def pair_mm(first: str, second: str) -> tuple[float, float]:
+        return _MM_PER_CM * value(first, 0), _MM_PER_CM * value(second, 0)
+
+    sides = "tde4_filmback_width_cm", "tde4_filmback_height_cm"
+    back = pair_mm(*sides) if node.knobs.keys() >= {*sides} else None
+    offset = pair_mm("tde4_lens_center_offset_x_cm", "tde4_lens_center_offset_y_cm")
+    values = {key: value(_nuke_name(key), default) for key, default in _PARAMETERS[model].items()}
+    return Lens(name, path, back, offset, model, values)
 
 
 def _nuke_name(name: str) -> str:
     return re.sub(r"[^A-Za-z0-9]+", "_", name.strip())
 
 
+@errors_name_file
 def _lens_lines(path: Path) -> list[str] | None:
     """Return the lines of a lens file; None for other text files; refuse a lens file with an invalid beginning."""
     try:
@@ -144,21 +141,20 @@ def _lens_lines(path: Path) -> list[str] | None:
     if "<end_of_file>" in lines:
         raise CalibrationError(
             "is a lens file, but does not begin with four lines: name, seven numbers, type of distortion, and model.",
-            path=path,
             hint="Export the lens again, or remove the file.",
         )
     return None
 
 
+@errors_name_file
 def _text_lens(path: Path, lines: list[str]) -> Lens:
     width, height, _, _, x, y, _ = (float(word) for word in lines[1].split())
     mode, model = lines[2], lines[3]
     if model not in _PARAMETERS:
-        raise _unread(path, model)
+        raise _unread(model)
     if mode not in _STATIC:
         raise CalibrationError(
             f'lens {lines[0]} has the type of distortion "{mode}"; expected a static lens ({" or ".join(_STATIC)}).',
-            path=path,
             hint="Make the lens static in 3DEqualizer and export it again.",
         )
     values = dict(_PARAMETERS[model])
@@ -169,25 +165,22 @@ def _text_lens(path: Path, lines: list[str]) -> Lens:
             at += 3 + int(lines[at + 2])
     except (ValueError, IndexError) as error:
         raise CalibrationError(
-            f'line {at + 1}: "{lines[at]:.60}" must be followed by its value, the number of curve keys, and the keys.',
-            path=path,
+            f'line {at + 1}: "{lines[at]:.60}" must be followed by its value, the number of curve keys, and the keys.'
         ) from error
     unknown = sorted(set(values) - set(_PARAMETERS[model]))
     if unknown or not np.isfinite(list(values.values())).all():
         raise CalibrationError(
             f'{model} has no parameter "{unknown[0]}"; its parameters are {", ".join(_PARAMETERS[model])}.'
             if unknown
-            else "has a value that is not finite.",
-            path=path,
+            else "has a value that is not finite."
         )
     back = (_MM_PER_CM * width, _MM_PER_CM * height)
     return Lens(lines[0], path, back, (_MM_PER_CM * x, _MM_PER_CM * y), model, values)
 
 
-def _unread(path: Path, model: str) -> CalibrationError:
+def _unread(model: str) -> CalibrationError:
     return CalibrationError(
         f'has the distortion model "{model}"; it must be one of {", ".join(_PARAMETERS)}.',
-        path=path,
         hint="Calibrate with one of them, or undistort the footage and remove the lens file.",
     )
 

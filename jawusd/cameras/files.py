@@ -21,7 +21,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from jawusd.base.arrays import Array
-from jawusd.base.errors import CalibrationError
+from jawusd.base.errors import CalibrationError, naming_file
 from jawusd.base.inputs import check_input
 from jawusd.base.tables import read_text
 from jawusd.geometry import Camera, make_transform, orthonormalise, rigidity_defect, se3_inverse
@@ -59,6 +59,11 @@ class CameraFormat:
     lacks_sizes: bool = False  # whether image sizes may be missing from the file
 
 
+def folder_of(path: Path) -> Path:
+    """Return a folder itself, or the folder of a file."""
+    return path if path.is_dir() else path.parent
+
+
 def files_in(path: Path, *suffixes: str) -> list[Path]:
     """Return the files of a folder that have one of the suffixes; none if the path is not a folder."""
     return sorted(file for file in path.iterdir() if file.suffix.lower() in suffixes) if path.is_dir() else []
@@ -69,7 +74,7 @@ def plain_name(name: str) -> str:
     return re.sub(r"[^A-Za-z0-9_\-]+", "_", name)
 
 
-def names_of_labels(path: Path, labels: Sequence[str]) -> list[str]:
+def names_of_labels(labels: Sequence[str]) -> list[str]:
     """Return a unique name for each image label, without folder or suffix where it is unique without them.
 
     Raises:
@@ -88,13 +93,12 @@ def names_of_labels(path: Path, labels: Sequence[str]) -> list[str]:
         alike = ", ".join(f'"{label}"' for label, own in zip(labels, names, strict=True) if own == name)
         raise CalibrationError(
             f"has {times} cameras with the same label: {alike}. Labels must be unique.",
-            path=path,
             hint="Rename the images (such as left_0001.jpg) or cameras, and export again.",
         )
     return names
 
 
-def known_size(path: Path, name: str, sizes: Mapping[str, Size]) -> Size:
+def known_size(name: str, sizes: Mapping[str, Size]) -> Size:
     """Return the size of a camera's images.
 
     Raises:
@@ -106,12 +110,11 @@ def known_size(path: Path, name: str, sizes: Mapping[str, Size]) -> Size:
     raise CalibrationError(
         f"camera {name}: the image size is not in the file, and no footage has that name "
         f"(available: {', '.join(sizes) or 'none'}).",
-        path=path,
         hint="Name the images after the [[camera]] tables, or set --size.",
     )
 
 
-def check_lens_model(path: Path, where: str, values: Mapping[str, object]) -> None:
+def check_lens_model(where: str, values: Mapping[str, object]) -> None:
     """Check that a file's lens model, if stated under a key that common programs use, is OpenCV's standard model.
 
     Raises:
@@ -126,12 +129,11 @@ def check_lens_model(path: Path, where: str, values: Mapping[str, object]) -> No
             raise CalibrationError(
                 f"{where} has {key} = {value}, a lens model that is not supported; use OpenCV's "
                 "radial-tangential model (plumb_bob, rational_polynomial).",
-                path=path,
                 hint=UNDISTORT,
             )
 
 
-def numbers(path: Path, text: str, count: int, what: str) -> Array:
+def numbers(text: str, count: int, what: str) -> Array:
     """Convert a text of `count` numbers to an array, shape (count,).
 
     Raises:
@@ -140,12 +142,17 @@ def numbers(path: Path, text: str, count: int, what: str) -> Array:
     try:
         values = np.array([float(word) for word in text.split()])
     except ValueError as error:
-        raise CalibrationError(f'{what}: "{text:.60}" is not a list of numbers.', path=path) from error
+        raise CalibrationError(f'{what}: "{text:.60}" is not a list of numbers.') from error
     if len(values) != count:
-        raise CalibrationError(f"{what} has {len(values)} values; expected {count}.", path=path)
+        raise CalibrationError(f"{what} has {len(values)} values; expected {count}.")
     if not np.isfinite(values).all():
-        raise CalibrationError(f"{what} has a value that is not finite.", path=path)
+        raise CalibrationError(f"{what} has a value that is not finite.")
     return values
+
+
+def number(text: str, what: str) -> float:
+    """Convert a text to a number; see `numbers`."""
+    return float(numbers(text, 1, what)[0])
 
 
 def parsed_xml(path: Path) -> ElementTree.Element:
@@ -157,14 +164,14 @@ def parsed_xml(path: Path) -> ElementTree.Element:
     """
     text = read_text(path, MOST_BYTES)
     if "<!DOCTYPE" in text or "<!ENTITY" in text:  # entities may read other files and expand without limit
-        raise CalibrationError("declares a document type, which is not allowed.", path=path)
+        raise CalibrationError("declares a document type, which is not allowed.")
     try:
         return ElementTree.fromstring(text)
     except (ElementTree.ParseError, ValueError) as error:
-        raise CalibrationError(f"cannot be read as XML ({error}).", path=path) from error
+        raise CalibrationError(f"cannot be read as XML ({error}).") from error
 
 
-def world_to_camera(path: Path, name: str, rotation: Array, centre: Array) -> Array:
+def world_to_camera(name: str, rotation: Array, centre: Array) -> Array:
     """Return T_cam_world from a camera's axes in the world (3, 3) and its centre (3,).
 
     Raises:
@@ -172,11 +179,11 @@ def world_to_camera(path: Path, name: str, rotation: Array, centre: Array) -> Ar
     """
     T_world_cam = make_transform(rotation, centre)
     if rigidity_defect(T_world_cam) > _LARGEST_DEFECT:
-        raise CalibrationError(f"camera {name} has a rotation that is not orthonormal.", path=path)
+        raise CalibrationError(f"camera {name} has a rotation that is not orthonormal.")
     return se3_inverse(orthonormalise(T_world_cam))
 
 
-def lens_with_k4(path: Path, name: str, K: Array, size: Size, radial: Array, tangential: tuple[float, float]) -> Array:
+def lens_with_k4(name: str, K: Array, size: Size, radial: Array, tangential: tuple[float, float]) -> Array:
     """Return OpenCV's coefficients for a lens with four radial coefficients and OpenCV's (p1, p2).
 
     Raises:
@@ -187,37 +194,36 @@ def lens_with_k4(path: Path, name: str, K: Array, size: Size, radial: Array, tan
         raise CalibrationError(
             f"camera {name}: its lens cannot be approximated by OpenCV's coefficients (error {error_px:.2f} px; "
             f"at most {_LARGEST_ERROR_PX:g} px is allowed).",
-            path=path,
             hint="Calibrate without k4, or undistort the footage first.",
         )
     lens = np.concatenate([k[:2], tangential, k[2:]])
     return lens if lens.any() else np.zeros(0)
 
 
-def corner_matrix(path: Path, where: str, fx: float, fy: float, cx: float, cy: float) -> Array:
+def corner_matrix(where: str, fx: float, fy: float, cx: float, cy: float) -> Array:
     """Return K (3, 3) in OpenCV's pixels from intrinsics in which the centre of the first pixel is at (0.5, 0.5).
 
     Raises:
         CalibrationError: a focal length is not positive.
     """
     if not (fx > 0 and fy > 0):
-        raise CalibrationError(f"{where} has focal lengths {fx:g} and {fy:g} px; they must be > 0 px.", path=path)
+        raise CalibrationError(f"{where} has focal lengths {fx:g} and {fy:g} px; they must be > 0 px.")
     return intrinsics(fx, fy, cx - 0.5, cy - 0.5)
 
 
-def cameras_of_images(path: Path, images: Sequence[tuple[str, Camera]]) -> list[Camera]:
-    """Return one camera per physical camera, sorted by name, from the (file, camera) of each image.
+def cameras_of_images(images: Sequence[Camera]) -> list[Camera]:
+    """Return one camera per physical camera, sorted by name, from the camera of each image, named after its file.
 
-    The camera's name is the image's folder (`cam0/0001.png` is cam0) or, without one, the file name (`cam0.png`).
+    The result's name is the image's folder (`cam0/0001.png` is cam0) or, without one, the file name (`cam0.png`).
 
     Raises:
         CalibrationError: images of one camera have different poses or lenses.
     """
-    places = [PurePosixPath(file.replace("\\", "/")) for file, _ in images]
+    places = [PurePosixPath(image.name.replace("\\", "/")) for image in images]
     alone = sorted({place.name for place in places if place.parent.name in ("", "images")})
-    names = dict(zip(alone, names_of_labels(path, alone), strict=True))
+    names = dict(zip(alone, names_of_labels(alone), strict=True))
     cameras: dict[str, Camera] = {}
-    for place, (_, camera) in zip(places, images, strict=True):
+    for place, camera in zip(places, images, strict=True):
         folder = place.parent.name
         name = names[place.name] if folder in ("", "images") else folder
         known = cameras.setdefault(name, replace(camera, name=name))
@@ -227,7 +233,6 @@ def cameras_of_images(path: Path, images: Sequence[tuple[str, Camera]]) -> list[
         if poses_differ or known.size_px != camera.size_px or not _same_lens(known, camera):
             raise CalibrationError(
                 f"camera {name} has different {'poses' if poses_differ else 'lenses'} in different images.",
-                path=path,
                 hint="Name images after their cameras, with one image (cam0.png) or one folder (cam0/0001.png) per "
                 "camera, and use one lens for all images of a camera.",
             )
@@ -268,7 +273,8 @@ def load_cameras_file(
     path = Path(path)
     if not path.is_dir():
         check_input(path, CalibrationError)
-    cameras = _format_of(path).load(path, {} if sizes is None else sizes)
+    with naming_file(path):
+        cameras = _format_of(path).load(path, {} if sizes is None else sizes)
     poses = [make_transform(camera.T_cam_world[:3, :3], unit_mm * camera.T_cam_world[:3, 3]) for camera in cameras]
     return [replace(camera, T_cam_world=pose) for camera, pose in zip(cameras, poses, strict=True)]
 

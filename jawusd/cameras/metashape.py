@@ -25,6 +25,7 @@ from jawusd.cameras.files import (
     Size,
     lens_with_k4,
     names_of_labels,
+    number,
     numbers,
     parsed_xml,
     world_to_camera,
@@ -52,51 +53,49 @@ def load_metashape(path: Path) -> list[Camera]:
         if (node.findtext("transform") or "").strip()
     ]
     if not nodes:
-        raise CalibrationError("has no aligned cameras.", path=path, hint="Align the photos, then export the cameras.")
-    names = names_of_labels(path, [str(node.get("label")) for _, node in nodes])
-    cameras = [_camera(path, name, chunk, node) for name, (chunk, node) in zip(names, nodes, strict=True)]
+        raise CalibrationError("has no aligned cameras.", hint="Align the photos, then export the cameras.")
+    names = names_of_labels([str(node.get("label")) for _, node in nodes])
+    cameras = [_camera(name, chunk, node) for name, (chunk, node) in zip(names, nodes, strict=True)]
     return sorted(cameras, key=lambda camera: camera.name)
 
 
-def _camera(path: Path, name: str, chunk: ElementTree.Element, node: ElementTree.Element) -> Camera:
+def _camera(name: str, chunk: ElementTree.Element, node: ElementTree.Element) -> Camera:
     sensors = {str(one.get("id")): one for one in chunk.iter("sensor")}
     components = {str(one.get("id")): one.find("transform") for one in chunk.iter("component")}
-    T_chunk_cam = numbers(path, node.findtext("transform", ""), 16, f"camera {name}").reshape(4, 4)
-    R, t, scale = _placement(path, components.get(str(node.get("component_id")), chunk.find("transform")))
+    T_chunk_cam = numbers(node.findtext("transform", ""), 16, f"camera {name}").reshape(4, 4)
+    R, t, scale = _placement(components.get(str(node.get("component_id")), chunk.find("transform")))
     sensor = sensors.get(str(node.get("sensor_id")))
     if sensor is None:
-        raise CalibrationError(f"camera {name} refers to a sensor that is not in the file.", path=path)
-    size, K, lens = _lens(path, sensor)
+        raise CalibrationError(f"camera {name} refers to a sensor that is not in the file.")
+    size, K, lens = _lens(sensor)
     centre = scale * R @ T_chunk_cam[:3, 3] + t
-    return Camera(name, size, K, lens, world_to_camera(path, name, R @ T_chunk_cam[:3, :3], centre))
+    return Camera(name, size, K, lens, world_to_camera(name, R @ T_chunk_cam[:3, :3], centre))
 
 
-def _lens(path: Path, sensor: ElementTree.Element) -> tuple[Size, Array, Array]:
+def _lens(sensor: ElementTree.Element) -> tuple[Size, Array, Array]:
     label = sensor.get("label") or sensor.get("id")
     found = {node.get("class", ""): node for node in sensor.findall("calibration")}
     node = found.get("adjusted") if "adjusted" in found else next(iter(found.values()), None)
     resolution = sensor.find("resolution") if node is None else node.find("resolution")
     resolution = sensor.find("resolution") if resolution is None else resolution
     if node is None or resolution is None:
-        raise CalibrationError(f"sensor {label} has no calibration.", path=path, hint="Align the photos first.")
+        raise CalibrationError(f"sensor {label} has no calibration.", hint="Align the photos first.")
     kind = node.get("type", sensor.get("type", "frame"))
     if kind != "frame":
         raise CalibrationError(
-            f'sensor {label} has the type "{kind}"; only sensors of type "frame" are supported.',
-            path=path,
-            hint=UNDISTORT,
+            f'sensor {label} has the type "{kind}"; only sensors of type "frame" are supported.', hint=UNDISTORT
         )
     values = {child.tag: child.text or "" for child in node}
 
     def value(key: str, other: float = 0.0) -> float:
-        return other if key not in values else float(numbers(path, values[key], 1, f"sensor {label} {key}")[0])
+        return other if key not in values else number(values[key], f"sensor {label} {key}")
 
-    sides = (numbers(path, resolution.get(side, "0"), 1, f"sensor {label} {side}")[0] for side in ("width", "height"))
+    sides = (number(resolution.get(side, "0"), f"sensor {label} {side}") for side in ("width", "height"))
     width, height = (int(min(side, _MOST_PX)) for side in sides)
     size = (width, height)
     focal = value("f", value("fy"))
     if not focal > 0 or min(size) < 1:
-        raise CalibrationError(f"sensor {label} has no focal length or no resolution.", path=path)
+        raise CalibrationError(f"sensor {label} has no focal length or no resolution.")
     wide = value("fx", focal + value("b1"))
     # Before version 1.0, cx and cy were relative to the image corner, and focal lengths were fx and fy.
     old = "fx" in values
@@ -105,22 +104,17 @@ def _lens(path: Path, sensor: ElementTree.Element) -> tuple[Size, Array, Array]:
     K = intrinsics(wide, focal, cx, cy, value("b2"))
     for key in ("p3", "p4"):  # former names of the tangential coefficients
         if value(key):
-            raise CalibrationError(
-                f"sensor {label} has {key} = {value(key):g}; it must be 0.", path=path, hint=UNDISTORT
-            )
+            raise CalibrationError(f"sensor {label} has {key} = {value(key):g}; it must be 0.", hint=UNDISTORT)
     radial = np.array([value(f"k{k}") for k in (1, 2, 3, 4)])
-    return size, K, lens_with_k4(path, str(label), K, size, radial, (value("p2"), value("p1")))
+    return size, K, lens_with_k4(str(label), K, size, radial, (value("p2"), value("p1")))
 
 
-def _placement(path: Path, node: ElementTree.Element | None) -> tuple[Array, Array, float]:
+def _placement(node: ElementTree.Element | None) -> tuple[Array, Array, float]:
     """Return rotation, translation and scale of a chunk's or component's transform; identity for None."""
-    if node is None:
-        return np.eye(3), np.zeros(3), 1.0
-    parts = {child.tag: child.text or "" for child in node}
-    R = numbers(path, parts["rotation"], 9, "rotation").reshape(3, 3) if "rotation" in parts else np.eye(3)
-    t = numbers(path, parts["translation"], 3, "translation") if "translation" in parts else np.zeros(3)
-    scale = float(numbers(path, parts["scale"], 1, "scale")[0]) if "scale" in parts else 1.0
-    return R, t, scale
+    parts = {} if node is None else {child.tag: child.text or "" for child in node}
+    R = numbers(parts.get("rotation", "1 0 0 0 1 0 0 0 1"), 9, "rotation").reshape(3, 3)
+    t = numbers(parts.get("translation", "0 0 0"), 3, "translation")
+    return R, t, number(parts.get("scale", "1"), "scale")
 
 
 FORMAT = CameraFormat(lambda path: path.suffix.lower() == ".xml", lambda path, _: load_metashape(path))

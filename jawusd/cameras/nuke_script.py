@@ -90,7 +90,7 @@ def _knobs(body: list[str]) -> dict[str, str]:
     return out
 
 
-def knob_values(path: Path, node: NukeNode, knob: str, default: tuple[float, ...]) -> Array:
+def knob_values(node: NukeNode, knob: str, default: tuple[float, ...]) -> Array:
     """Return the values of a knob at its key frames, shape (F, C), where C is the length of the default.
 
     Raises:
@@ -105,30 +105,28 @@ def knob_values(path: Path, node: NukeNode, knob: str, default: tuple[float, ...
     except ValueError as error:
         raise CalibrationError(
             f'node {node.name}: {knob} is "{text:.60}"; expected numbers.',
-            path=path,
             hint="Bake expressions, or export again from the tracking program.",
         ) from error
     frames = max((len(column) for column in values), default=0)
     filled = [column * frames if len(column) == 1 else column for column in values]
     if len(filled) != len(default) or any(len(column) != frames for column in filled) or not frames:
-        raise CalibrationError(f'node {node.name}: {knob} is "{text:.60}"; expected {len(default)} numbers.', path=path)
+        raise CalibrationError(f'node {node.name}: {knob} is "{text:.60}"; expected {len(default)} numbers.')
     table = np.array(filled).T
     if not np.isfinite(table).all():
-        raise CalibrationError(f"node {node.name}: {knob} has a value that is not finite.", path=path)
+        raise CalibrationError(f"node {node.name}: {knob} has a value that is not finite.")
     return table
 
 
-def steady_values(path: Path, node: NukeNode, knob: str, default: tuple[float, ...]) -> Array:
+def steady_values(node: NukeNode, knob: str, default: tuple[float, ...]) -> Array:
     """Return the values of a constant knob, shape (C,); see `knob_values`.
 
     Raises:
         CalibrationError: the knob is animated.
     """
-    table = knob_values(path, node, knob, default)
+    table = knob_values(node, knob, default)
     if np.ptp(table, axis=0).max() > SAME * max(1e-6, float(np.abs(table[0]).max())):
         raise CalibrationError(
             f"node {node.name}: {knob} is animated; it must be constant.",
-            path=path,
             hint="The lenses of a capture do not change: solve with a fixed focal length, and export again.",
         )
     return np.asarray(table[0], np.float64)

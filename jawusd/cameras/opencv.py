@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from jawusd.base.arrays import Array
-from jawusd.base.errors import CalibrationError
+from jawusd.base.errors import CalibrationError, errors_name_file, naming_file
 from jawusd.base.tables import read_text
 from jawusd.cameras.files import CameraFormat, Size, check_lens_model, files_in, known_size, parsed_xml
 from jawusd.formats.text import parse_json
@@ -55,17 +55,7 @@ def load_opencv(paths: list[Path], sizes: Mapping[str, Size]) -> list[Camera]:
     """
     found: dict[str, dict[str, Array]] = {}
     for path in paths:
-        for name, parts in _parts_of(path).items():
-            own = found.setdefault(name, {})
-            twice = [role for role in parts if role in own and not np.array_equal(parts[role], own[role])]
-            if twice:
-                raise CalibrationError(
-                    f"and another file in the folder have different values of {twice[0]} for camera "
-                    f"{name or path.stem}.",
-                    path=path,
-                    hint="Give each camera its own file and name.",
-                )
-            own.update(parts)
+        _merge(path, found)
     shared = found.pop("", {}) if any("K" in parts for name, parts in found.items() if name) else {}
     if set(found) == {"1", "2"} and {"R", "T"} <= set(shared):  # a stereo pair: the world frame is the first camera's
         found["1"] |= {"R": np.eye(3), "T": np.zeros(3)}
@@ -73,10 +63,25 @@ def load_opencv(paths: list[Path], sizes: Mapping[str, Size]) -> list[Camera]:
     whole = {name: shared | parts for name, parts in found.items()}
     posed = {name: parts for name, parts in whole.items() if len({"K", "R", "T"} & parts.keys()) > 1}
     known = {name: parts for name, parts in whole.items() if "K" in parts}
-    cameras = [_camera(paths[0], name, parts, sizes) for name, parts in (posed or known).items()]
-    if not cameras:
-        raise CalibrationError("has no camera matrix.", path=paths[0])
+    with naming_file(paths[0]):
+        cameras = [_camera(name, parts, sizes) for name, parts in (posed or known).items()]
+        if not cameras:
+            raise CalibrationError("has no camera matrix.")
     return sorted(cameras, key=lambda camera: camera.name)
+
+
+@errors_name_file
+def _merge(path: Path, found: dict[str, dict[str, Array]]) -> None:
+    """Add the values of a file to those found in other files, by camera name and role."""
+    for name, parts in _parts_of(path).items():
+        own = found.setdefault(name, {})
+        twice = [role for role in parts if role in own and not np.array_equal(parts[role], own[role])]
+        if twice:
+            raise CalibrationError(
+                f"and another file in the folder have different values of {twice[0]} for camera {name or path.stem}.",
+                hint="Give each camera its own file and name.",
+            )
+        own.update(parts)
 
 
 def _parts_of(path: Path) -> dict[str, dict[str, Array]]:
@@ -84,35 +89,33 @@ def _parts_of(path: Path) -> dict[str, dict[str, Array]]:
     out: dict[str, dict[str, Array]] = {}
     seen: set[str] = set()
     for key, shape, words in _values(path):
-        check_lens_model(path, "the file", {key: " ".join(words)})
+        check_lens_model("the file", {key: " ".join(words)})
         for role, pattern in _ROLES.items():
             named = re.fullmatch(rf"{pattern}(?:_?(?P<camera>\d+|(?<=_)[\w-]+))?", key, re.IGNORECASE)
             if named is None or (not shape and role not in ("width", "height")):
                 continue
             if key in seen:
                 raise CalibrationError(
-                    f'has "{key}" twice.',
-                    path=path,
-                    hint="Write one file per camera, or names such as K_left, K_right.",
+                    f'has "{key}" twice.', hint="Write one file per camera, or names such as K_left, K_right."
                 )
             seen.add(key)
             parts = out.setdefault(named["camera"] or "", {})
             if not (role == "R" and parts.get("R") is not None and parts["R"].shape == (3, 3)):
-                parts[role] = _array(path, key, shape, words)
+                parts[role] = _array(key, shape, words)
             break
     return {path.stem: out[""]} if set(out) == {""} else out
 
 
-def _array(path: Path, key: str, shape: tuple[int, ...], words: list[str]) -> Array:
+def _array(key: str, shape: tuple[int, ...], words: list[str]) -> Array:
     # OpenCV writes .Nan and -.Inf, which float() rejects
     plain = [re.sub(r"^([-+]?)\.(?=nan|inf)", r"\1", word.lower()) for word in words]
     try:
         data = np.array([float(word) for word in plain]).reshape(shape)
     except ValueError as error:
         what = "does not match its rows and cols" if shape else f"is {' '.join(words):.40}, which is not a number"
-        raise CalibrationError(f'"{key}" {what}.', path=path) from error
+        raise CalibrationError(f'"{key}" {what}.') from error
     if not np.isfinite(data).all():
-        raise CalibrationError(f'"{key}" has a value that is not finite.', path=path)
+        raise CalibrationError(f'"{key}" has a value that is not finite.')
     return data
 
 
@@ -133,11 +136,8 @@ def _values(path: Path) -> Iterator[tuple[str, tuple[int, ...], list[str]]]:
         for name, value in stored.items() if isinstance(stored, dict) else ():
             if isinstance(value, dict) and isinstance(value.get("data"), list):
                 rows, cols = value.get("rows"), value.get("cols")
-                yield (
-                    name,
-                    (rows, cols) if isinstance(rows, int) and isinstance(cols, int) else (-1, -1),
-                    [str(word) for word in value["data"]],
-                )
+                shape = (rows, cols) if isinstance(rows, int) and isinstance(cols, int) else (-1, -1)
+                yield name, shape, [str(word) for word in value["data"]]
             elif not isinstance(value, dict | list):
                 yield name, (), [str(value)]
         return
@@ -164,32 +164,31 @@ def _stored(path: Path) -> list[Path]:
     return [path, pair] if path.stem in ("intri", "intrinsics") and pair.exists() else [path]
 
 
-def _camera(path: Path, name: str, parts: Mapping[str, Array], sizes: Mapping[str, Size]) -> Camera:
+def _camera(name: str, parts: Mapping[str, Array], sizes: Mapping[str, Size]) -> Camera:
     lacking = [role for role in ("K", "R", "T") if role not in parts]
     if lacking:
         raise CalibrationError(
-            f"camera {name} has no {lacking[0]}.", path=path, hint="Both pose (R, T) and camera matrix (K) are needed."
+            f"camera {name} has no {lacking[0]}.", hint="Both pose (R, T) and camera matrix (K) are needed."
         )
     if "width" in parts and "height" in parts:
         sides = np.array([parts["width"], parts["height"]], np.float64).ravel()
         if sides.size != 2 or not ((sides >= 1) & (sides <= _MOST_PX)).all():
             raise CalibrationError(
-                f"camera {name} has image size {sides.tolist()} px; width and height must be 1 to 1e6 px.", path=path
+                f"camera {name} has image size {sides.tolist()} px; width and height must be 1 to 1e6 px."
             )
         size = (int(sides[0]), int(sides[1]))
     else:
-        size = known_size(path, name, sizes)
+        size = known_size(name, sizes)
     R = so3_exp(parts["R"].ravel()) if parts["R"].size == 3 else parts["R"]
     K, T, lens = parts["K"], parts["T"].ravel(), parts.get("dist", np.zeros(0)).ravel()
     if K.shape != (3, 3) or R.shape != (3, 3) or T.shape != (3,) or lens.size not in (0, 4, 5, 8, 12, 14):
-        raise CalibrationError(f"camera {name} has a matrix of the wrong size.", path=path)
+        raise CalibrationError(f"camera {name} has a matrix of the wrong size.")
     if lens[8:].any():
         raise CalibrationError(
-            f"camera {name} has thin-prism or tilt coefficients; only the first 8 coefficients are supported.",
-            path=path,
+            f"camera {name} has thin-prism or tilt coefficients; only the first 8 coefficients are supported."
         )
     if rigidity_defect(make_transform(R, np.zeros(3))) > _LARGEST_DEFECT or not np.isfinite(K).all():
-        raise CalibrationError(f"camera {name} has a rotation that is not orthonormal.", path=path)
+        raise CalibrationError(f"camera {name} has a rotation that is not orthonormal.")
     return Camera(name, size, K, lens[:8], make_transform(R, T))
 
 

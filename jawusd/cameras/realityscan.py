@@ -21,15 +21,17 @@ from xml.etree import ElementTree
 import numpy as np
 
 from jawusd.base.arrays import Array
-from jawusd.base.errors import CalibrationError
+from jawusd.base.errors import CalibrationError, errors_name_file
 from jawusd.base.tables import read_table
 from jawusd.cameras.files import (
     CameraFormat,
     Size,
     files_in,
+    folder_of,
     known_size,
     lens_with_k4,
     names_of_labels,
+    number,
     numbers,
     parsed_xml,
     world_to_camera,
@@ -55,35 +57,35 @@ def load_realityscan_xmp(folder: Path, sizes: Mapping[str, Size]) -> list[Camera
         CalibrationError: a file is not XML, a size is unknown, or a value is missing or wrong.
         FormatError: a file cannot be read.
     """
-    out = []
-    for path in files_in(folder, ".xmp"):
-        node = next(parsed_xml(path).iter(f"{_RDF}Description"), None)
-        values = {} if node is None else _xmp_values(node)
-        if "Rotation" not in values or "Position" not in values:
-            raise CalibrationError("has no Rotation or no Position.", path=path, hint="Export XMP with camera poses.")
-        size = known_size(path, path.stem, sizes)
-        f35 = numbers(path, values.get("FocalLength35mm", ""), 1, "FocalLength35mm")[0]
-        principal = [float(numbers(path, values.get(f"PrincipalPoint{a}", "0"), 1, "PrincipalPoint")[0]) for a in "UV"]
-        model = values.get("DistortionModel", "perspective").lower()
-        if not model.startswith(("brown", "perspective")):
-            raise CalibrationError(
-                f'has the distortion model "{model}"; expected "brown3" or "brown4".',
-                path=path,
-                hint="Choose Brown3 or Brown4 with tangential distortion, and align again.",
-            )
-        terms = numbers(path, values.get("DistortionCoeficients", "0 0 0 0 0 0"), 6, "DistortionCoeficients")
-        for key, square in (("Skew", 0.0), ("AspectRatio", 1.0)):
-            if abs(numbers(path, values.get(key, str(square)), 1, key)[0] - square) > _LARGEST_SKEW:
-                raise CalibrationError(
-                    f"has {key} {values[key]}; it must be {square:g}.", path=path, hint="Align with square pixels."
-                )
-        K, lens = _lens(path, path.stem, size, f35, (principal[0], principal[1]), terms)
-        rotation = numbers(path, values["Rotation"], 9, "Rotation").reshape(3, 3)
-        centre = numbers(path, values["Position"], 3, "Position")
-        out.append(Camera(path.stem, size, K, lens, world_to_camera(path, path.stem, rotation.T, centre)))
-    if not out:
-        raise CalibrationError("has no .xmp files.", path=folder)
-    return out
+    cameras = [_camera_of_xmp(path, sizes) for path in files_in(folder, ".xmp")]
+    if not cameras:
+        raise CalibrationError("has no .xmp files.")
+    return cameras
+
+
+@errors_name_file
+def _camera_of_xmp(path: Path, sizes: Mapping[str, Size]) -> Camera:
+    node = next(parsed_xml(path).iter(f"{_RDF}Description"), None)
+    values = {} if node is None else _xmp_values(node)
+    if "Rotation" not in values or "Position" not in values:
+        raise CalibrationError("has no Rotation or no Position.", hint="Export XMP with camera poses.")
+    size = known_size(path.stem, sizes)
+    f35 = number(values.get("FocalLength35mm", ""), "FocalLength35mm")
+    u, v = (number(values.get(f"PrincipalPoint{axis}", "0"), "PrincipalPoint") for axis in "UV")
+    model = values.get("DistortionModel", "perspective").lower()
+    if not model.startswith(("brown", "perspective")):
+        raise CalibrationError(
+            f'has the distortion model "{model}"; expected "brown3" or "brown4".',
+            hint="Choose Brown3 or Brown4 with tangential distortion, and align again.",
+        )
+    terms = numbers(values.get("DistortionCoeficients", "0 0 0 0 0 0"), 6, "DistortionCoeficients")
+    for key, square in (("Skew", 0.0), ("AspectRatio", 1.0)):
+        if abs(number(values.get(key, str(square)), key) - square) > _LARGEST_SKEW:
+            raise CalibrationError(f"has {key} {values[key]}; it must be {square:g}.", hint="Align with square pixels.")
+    K, lens = _lens(path.stem, size, f35, (u, v), terms)
+    rotation = numbers(values["Rotation"], 9, "Rotation").reshape(3, 3)
+    centre = numbers(values["Position"], 3, "Position")
+    return Camera(path.stem, size, K, lens, world_to_camera(path.stem, rotation.T, centre))
 
 
 def load_realityscan_csv(path: Path, sizes: Mapping[str, Size]) -> list[Camera]:
@@ -97,39 +99,37 @@ def load_realityscan_csv(path: Path, sizes: Mapping[str, Size]) -> list[Camera]:
     header = [word.lstrip("#").strip().lower() for word in table.header]
     lacking = [key for key in _NEEDED if key not in header]
     if lacking:
-        raise CalibrationError(f"has no column {lacking[0]}; expected the columns {', '.join(_NEEDED)}.", path=path)
+        raise CalibrationError(f"has no column {lacking[0]}; expected the columns {', '.join(_NEEDED)}.")
     columns = [k for k, key in enumerate(header) if key in (*_NEEDED[1:], *_LENS)]
     column = header.index("name")
-    names = names_of_labels(path, [row[column] for row in table.rows])
+    names = names_of_labels([row[column] for row in table.rows])
     out = []
     for where, name, values in zip(table.places, names, table.numbers(columns), strict=True):
         if not np.isfinite(values).all():
-            raise CalibrationError(f"{where} has a value that is not finite.", path=path)
+            raise CalibrationError(f"{where} has a value that is not finite.")
         found = {header[k]: float(value) for k, value in zip(columns, values)}
-        size = known_size(path, name, sizes)
+        size = known_size(name, sizes)
         terms = np.array([found.get(key, 0.0) for key in _LENS[2:]])
-        K, lens = _lens(path, name, size, found["f"], (found.get("px", 0.0), found.get("py", 0.0)), terms)
+        K, lens = _lens(name, size, found["f"], (found.get("px", 0.0), found.get("py", 0.0)), terms)
         heading, pitch, roll = (np.deg2rad(found[key]) for key in ("heading", "pitch", "roll"))
         turns = so3_exp(np.array([[0, 0, -heading], [pitch, 0, 0], [0, roll, 0]]))
         axes = turns[0] @ turns[1] @ turns[2] @ _OPENGL
         T_world_cam = make_transform(axes, np.array([found["x"], found["y"], found["alt"]]))
         out.append(Camera(name, size, K, lens, se3_inverse(T_world_cam)))
     if not out:
-        raise CalibrationError("has no cameras.", path=path)
+        raise CalibrationError("has no cameras.")
     return sorted(out, key=lambda camera: camera.name)
 
 
-def _lens(
-    path: Path, name: str, size: Size, f35_mm: float, principal: tuple[float, float], terms: Array
-) -> tuple[Array, Array]:
+def _lens(name: str, size: Size, f35_mm: float, principal: tuple[float, float], terms: Array) -> tuple[Array, Array]:
     """Return K (3, 3) and OpenCV's coefficients from RealityScan's values; `terms` are k1 k2 k3 k4 t1 t2."""
     longer = max(size)
     if not f35_mm > 0:
-        raise CalibrationError(f"camera {name} has focal length {f35_mm:g} mm; it must be > 0.", path=path)
+        raise CalibrationError(f"camera {name} has focal length {f35_mm:g} mm; it must be > 0.")
     focal = f35_mm / _FILM_MM * longer
     cx, cy = (principal[k] * longer + size[k] / 2 - _HALF_PX for k in (0, 1))
     K = intrinsics(focal, focal, cx, cy)
-    return K, lens_with_k4(path, name, K, size, terms[:4], (float(terms[4]), float(terms[5])))
+    return K, lens_with_k4(name, K, size, terms[:4], (float(terms[4]), float(terms[5])))
 
 
 def _xmp_values(node: ElementTree.Element) -> dict[str, str]:
@@ -140,12 +140,12 @@ def _xmp_values(node: ElementTree.Element) -> dict[str, str]:
 def _load(path: Path, sizes: Mapping[str, Size]) -> list[Camera]:
     if path.suffix.lower() == ".csv":
         return load_realityscan_csv(path, sizes)
-    return load_realityscan_xmp(path if path.is_dir() else path.parent, sizes)
+    return load_realityscan_xmp(folder_of(path), sizes)
 
 
 FORMAT = CameraFormat(
     lambda path: path.suffix.lower() in (".csv", ".xmp") or bool(files_in(path, ".xmp")),
     _load,
-    lambda path: [path] if path.suffix.lower() == ".csv" else files_in(path if path.is_dir() else path.parent, ".xmp"),
+    lambda path: [path] if path.suffix.lower() == ".csv" else files_in(folder_of(path), ".xmp"),
     lacks_sizes=True,
 )

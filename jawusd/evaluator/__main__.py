@@ -22,7 +22,7 @@ from pathlib import Path
 import numpy as np
 
 from jawusd.base.arrays import Array
-from jawusd.base.errors import FormatError, JawusdError
+from jawusd.base.errors import FormatError, JawusdError, errors_name_file
 from jawusd.base.tables import read_table
 from jawusd.evaluator.rig import JawRig, load
 
@@ -141,6 +141,7 @@ def _plain(value: object) -> object:
     return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
+@errors_name_file
 def _read_poses(path: Path) -> tuple[list[int], Array]:
     """Return frame numbers and T_skull_mandible (F, 4, 4) of a CSV table; nan and inf are kept."""
     table = read_table(path, _MAX_BYTES)

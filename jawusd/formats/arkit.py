@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jawusd.base.arrays import Array
-from jawusd.base.errors import FormatError
+from jawusd.base.errors import FormatError, errors_name_file
 from jawusd.base.tables import TextTable, check_width, read_table
 
 _OTHER = re.compile(r"(head|lefteye|righteye)(yaw|pitch|roll)")  # columns of rotations, which are not blend shapes
@@ -71,6 +71,7 @@ def shares_of(weights: Array) -> Array:
     return np.stack([opening, left - right, forward], axis=1)
 
 
+@errors_name_file
 def read_arkit(path: str | os.PathLike[str], fps: float | None = None) -> FaceCapture:
     """Read a face capture (CSV) of Live Link Face.
 
@@ -88,6 +89,7 @@ def read_arkit(path: str | os.PathLike[str], fps: float | None = None) -> FaceCa
     return FaceCapture(frames, _weights(table, columns, [columns.index(name) for name in JAW_COLUMNS]), rate, first)
 
 
+@errors_name_file
 def read_blend_shapes(path: str | os.PathLike[str], fps: float | None = None) -> BlendShapes:
     """Read all blend shapes of a face capture of Live Link Face (see `read_arkit`); rotations are left out.
 
@@ -97,7 +99,7 @@ def read_blend_shapes(path: str | os.PathLike[str], fps: float | None = None) ->
     table, columns = _read_columns(Path(path), (_TIME,))
     shapes = [k for k, name in enumerate(columns) if name not in (_TIME, _COUNT) and not _OTHER.fullmatch(name)]
     if not shapes:
-        raise FormatError("has no columns of blend shapes.", path=path)
+        raise FormatError("has no columns of blend shapes.")
     frames, rate, _ = _timed(table, columns.index(_TIME), fps)
     return BlendShapes(frames, _weights(table, columns, shapes), tuple(table.header[k] for k in shapes), rate)
 
@@ -110,18 +112,17 @@ def _read_columns(path: Path, needed: tuple[str, ...]) -> tuple[TextTable, list[
         if columns.count(name) != 1:
             raise FormatError(
                 f'has {columns.count(name)} columns named "{name}"; expected one.',
-                path=path,
                 hint="Live Link Face exports Timecode, JawOpen, JawLeft, JawRight and JawForward.",
             )
     if not table.rows:
-        raise FormatError("has no rows below the header.", path=path)
+        raise FormatError("has no rows below the header.")
     return table, columns
 
 
 def _timed(table: TextTable, at: int, fps: float | None) -> tuple[Array, float, str]:
     """Return frame numbers (F,), the frame rate [Hz], and the first time code, given a column of time codes."""
     written = [row[at].strip() if len(row) > at else "" for row in table.rows]
-    codes = np.array([_seconds_and_frame(code, table.named(i, at), table.path) for i, code in enumerate(written)])
+    codes = np.array([_seconds_and_frame(code, table.named(i, at)) for i, code in enumerate(written)])
     seconds, inside = codes[:, 0].astype(np.int64), _spread(codes)
     # Time codes start again at midnight.
     seconds += _DAY_S * np.concatenate([[0], np.cumsum(np.diff(seconds) < -_DAY_S // 2)])
@@ -145,7 +146,7 @@ def _weights(table: TextTable, columns: list[str], shapes: list[int]) -> Array:
     bad = np.argwhere(~np.isfinite(found))
     if len(bad):
         i, k = seen[bad[0, 0]], shapes[bad[0, 1]]
-        raise FormatError(f"{table.named(i, k)} is {table.rows[i][k]}; all weights must be finite.", path=table.path)
+        raise FormatError(f"{table.named(i, k)} is {table.rows[i][k]}; all weights must be finite.")
     weights = np.full((len(table.rows), len(shapes)), np.nan)
     weights[seen] = found
     _check_weights(weights, shapes, table)
@@ -165,15 +166,14 @@ def _check_weights(weights: Array, shapes: list[int], table: TextTable) -> None:
     raise FormatError(
         f"{table.named(int(row), shapes[column])} is {worst:g}; ARKit weights range from 0 to 1; values "
         f"from {_LEAST_WEIGHT:g} to {_MOST_WEIGHT:g} are accepted.",
-        path=table.path,
         hint=hint,
     )
 
 
-def _seconds_and_frame(code: str, named: str, path: Path) -> tuple[int, float]:
+def _seconds_and_frame(code: str, named: str) -> tuple[int, float]:
     found = _TIMECODE.fullmatch(code)
     if found is None:
-        raise FormatError(f'{named}: "{code}" is not of the form HH:MM:SS:FF.fff.', path=path)
+        raise FormatError(f'{named}: "{code}" is not of the form HH:MM:SS:FF.fff.')
     hours, minutes, seconds = (int(part) for part in found.groups()[:3])
     return 3600 * hours + 60 * minutes + seconds, float(found[4].replace(",", "."))
 
@@ -222,7 +222,6 @@ def _numbers_per_second(
         raise FormatError(
             "the frame rate cannot be found from the time codes: there is no full second, or the rate is not one of "
             f"{', '.join(map(str, _RATES))} frames per second.",
-            path=table.path,
             hint="Set the rate with --fps." if fps is None else None,
         )
     samples = float(np.median(rows_of_whole)) if rows_of_whole.size else 0.0
@@ -234,7 +233,6 @@ def _numbers_per_second(
         raise FormatError(
             f"{table.named(top, column)} has frame number {highest}{counted}; at {fps:g} frames per second, frame "
             f"numbers must be 0 .. {given - 1}.",
-            path=table.path,
             hint="Omit --fps; --resample changes the rate of the motion." if counted else None,
         )
     return found
@@ -263,7 +261,5 @@ def _frames(
     steps = np.diff(frames)
     if (steps <= 0).any():
         row = int(np.argmax(steps <= 0)) + 1
-        raise FormatError(
-            f"{table.named(row, column)} is not later than the row before; time codes must increase.", path=table.path
-        )
+        raise FormatError(f"{table.named(row, column)} is not later than the row before; time codes must increase.")
     return frames - frames[0]

@@ -17,7 +17,7 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
-from jawusd.base.errors import FormatError
+from jawusd.base.errors import FormatError, errors_name_file
 from jawusd.formats.text import read_text
 
 _MAX_BYTES = 16 << 20
@@ -32,6 +32,7 @@ class ListedCapture:
     name: str  # name of the output folder, unique in the list
 
 
+@errors_name_file
 def load_capture_list(path: str | os.PathLike[str]) -> list[ListedCapture]:
     """Read a list of captures.
 
@@ -44,37 +45,35 @@ def load_capture_list(path: str | os.PathLike[str]) -> list[ListedCapture]:
     for number, line in enumerate(read_text(path, _MAX_BYTES).splitlines(), start=1):
         if not line.strip() or line.lstrip().startswith("#"):
             continue
-        item = _listed(line, folder, path, number)
+        item = _listed(line, folder, number)
         # names are compared in lower case, since some file systems are case-insensitive
         earlier = lines.setdefault(item.name.casefold(), number)
         if earlier != number:
             raise FormatError(
                 f'lines {earlier} and {number} have the same output folder "{item.name}".',
-                path=path,
                 hint="Add a different name after a comma: PATH, NAME.",
             )
         found.append(item)
     if not found:
-        raise FormatError("lists no captures; expected one path per line.", path=path)
+        raise FormatError("lists no captures; expected one path per line.")
     return found
 
 
-def _listed(line: str, folder: Path, path: Path, number: int) -> ListedCapture:
+def _listed(line: str, folder: Path, number: int) -> ListedCapture:
     try:
         (cells,) = csv.reader([line], strict=True, skipinitialspace=True)
     except (csv.Error, ValueError) as error:
-        raise FormatError(f"line {number} is not CSV ({error}).", path=path) from error
+        raise FormatError(f"line {number} is not CSV ({error}).") from error
     cells = [cell.strip() for cell in cells]
     while len(cells) > 1 and not cells[-1]:  # remove blank columns appended by spreadsheets
         cells.pop()
     if len(cells) > 2 or not cells[0] or "\0" in cells[0]:
-        raise FormatError(f"line {number} must be a path, optionally followed by a comma and a name.", path=path)
+        raise FormatError(f"line {number} must be a path, optionally followed by a comma and a name.")
     capture = Path(os.path.normpath(folder / cells[0]))
     name = cells[1] if len(cells) == 2 else _default_name(capture)
     if not _NAME.fullmatch(name) or name.endswith((".", " ")):
         raise FormatError(
             f'line {number}: "{name}" is not a valid folder name; use only letters, digits, "_", "-", "." and spaces.',
-            path=path,
             hint="Add a name after a comma: PATH, NAME.",
         )
     return ListedCapture(capture, name)

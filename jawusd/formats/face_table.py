@@ -10,13 +10,13 @@ from __future__ import annotations
 
 import os
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from jawusd.base.arrays import Array
-from jawusd.base.errors import FormatError
+from jawusd.base.errors import FormatError, errors_name_file, naming_file
 from jawusd.base.tables import TextTable, check_width, read_table, read_text, split_rows
 
 _MAX_BYTES = 1 << 30
@@ -35,16 +35,16 @@ class FaceTable:
     unit: str | None = None  # length unit of points, None if unknown
 
 
+@errors_name_file
 def header_of(path: str | os.PathLike[str]) -> list[str]:
     """Return the cells of the first row of a text table, in lower case.
 
     Raises:
         FormatError: the file is not text, or empty.
     """
-    path = Path(path)
-    rows, _ = split_rows(read_text(path, _MAX_BYTES), path)
+    rows, _ = split_rows(read_text(Path(path), _MAX_BYTES))
     if not rows:
-        raise FormatError("is empty.", path=path)
+        raise FormatError("is empty.")
     return [cell.strip().lower() for cell in rows[0][1]]
 
 
@@ -53,6 +53,7 @@ def is_face_table(header: list[str]) -> bool:
     return any(clock in header for clock in _CLOCKS)
 
 
+@errors_name_file
 def read_face_table(path: str | os.PathLike[str]) -> FaceTable:
     """Read a face table.
 
@@ -69,11 +70,11 @@ def read_face_row(header: str, row: str, number: int, path: str | os.PathLike[st
     Raises:
         FormatError: as for `read_face_table`.
     """
-    path = Path(path)
-    rows, _ = split_rows(f"{header}\n{row}", path)
-    table = TextTable(path, [name.strip() for name in rows[0][1]], [rows[-1][1]], [f"line {number}"])
-    check_width(table, 0)
-    return _face_of(table)
+    with naming_file(path):
+        rows, _ = split_rows(f"{header}\n{row}")
+        table = TextTable([name.strip() for name in rows[0][1]], [rows[-1][1]], [f"line {number}"])
+        check_width(table, 0)
+        return _face_of(table)
 
 
 def _face_of(table: TextTable) -> FaceTable:
@@ -84,8 +85,7 @@ def _face_of(table: TextTable) -> FaceTable:
     if len({lower[k] for k in clocks}) != len(clocks) or not clocks or not others or not table.rows:
         raise FormatError(
             f"has the columns {', '.join(table.header[:8])} and {len(table.rows)} rows; expected one column frame "
-            "or time_s, other columns, and at least one row.",
-            path=table.path,
+            "or time_s, other columns, and at least one row."
         )
     clock = lower.index("time_s") if "time_s" in lower else clocks[0]
     frames = table.numbers([clock])[:, 0]
@@ -93,11 +93,10 @@ def _face_of(table: TextTable) -> FaceTable:
     wrong[1:] |= ~(np.diff(frames) > 0)
     if wrong.any():
         raise FormatError(
-            f"{table.named(int(np.argmax(wrong)), clock)} must be a finite number above that of the row before.",
-            path=table.path,
+            f"{table.named(int(np.argmax(wrong)), clock)} must be a finite number above that of the row before."
         )
     filled = [[cell if cell.strip() else "nan" for cell in row] for row in table.rows]
-    X = TextTable(table.path, table.header, filled, table.places).numbers(others)
+    X = replace(table, rows=filled).numbers(others)
     X[~np.isfinite(X)] = np.nan
     names = tuple(table.header[k] for k in others)
     fps = 1.0 if lower[clock] == "time_s" else None

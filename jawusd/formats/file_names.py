@@ -12,7 +12,7 @@ from collections import defaultdict
 from collections.abc import Iterable, Mapping
 from pathlib import Path, PurePath
 
-from jawusd.base.errors import CaptureError
+from jawusd.base.errors import CaptureError, errors_name_file
 
 _PRINTF = re.compile(r"%(?:0(\d+))?d")
 _HASHES = re.compile(r"#+")
@@ -48,6 +48,7 @@ def is_pattern(path: Path) -> bool:
         return False
 
 
+@errors_name_file
 def numbered_files(pattern: Path) -> dict[int, Path]:
     """Return the files of a pattern by number, in increasing order.
 
@@ -58,7 +59,7 @@ def numbered_files(pattern: Path) -> dict[int, Path]:
     name = pattern.name
     folder = pattern.parent
     if not folder.is_dir():
-        raise CaptureError(f"there is no folder {folder}.", path=pattern, hint="Correct the path in capture.toml.")
+        raise CaptureError(f"there is no folder {folder}.", hint="Correct the path in capture.toml.")
     matches = _matching(pattern)
     found: dict[int, Path] = {}
     for entry in sorted(folder.iterdir()):
@@ -71,12 +72,11 @@ def numbered_files(pattern: Path) -> dict[int, Path]:
             single = next(iter(groups([entry.name])), entry.name)
             raise CaptureError(
                 f"{found[number].name} and {entry.name} both have the number {number}.",
-                path=pattern,
                 hint=f"Write a pattern that matches only one of them, such as {single}.",
             )
         found[number] = entry
     if not found:
-        raise CaptureError(f"no file in the folder matches {name}.", path=pattern, hint=_offer(folder))
+        raise CaptureError(f"no file in the folder matches {name}.", hint=_offer(folder))
     return dict(sorted(found.items()))
 
 
@@ -87,16 +87,14 @@ def _matching(pattern: Path) -> re.Pattern[str]:
         places = list(sign.finditer(name))
         if len(places) > 1:
             raise CaptureError(
-                "the pattern has two numbers; only one is allowed.",
-                path=pattern,
-                hint="Write the fixed number in digits.",
+                "the pattern has two numbers; only one is allowed.", hint="Write the fixed number in digits."
             )
         if places:
             start, end = places[0].span()
             digits = rf"(\d{{{width(places[0])},}})"
             return re.compile(re.escape(name[:start]) + digits + re.escape(name[end:]))
     if "%" in name:
-        raise CaptureError("the pattern needs a number such as %06d.", path=pattern, hint="Correct it in capture.toml.")
+        raise CaptureError("the pattern needs a number such as %06d.", hint="Correct it in capture.toml.")
     return re.compile(fnmatch.translate(name))
 
 

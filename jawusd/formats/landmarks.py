@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from jawusd.base.arrays import Array
-from jawusd.base.errors import FormatError, UnitsError
+from jawusd.base.errors import FormatError, UnitsError, errors_name_file
 from jawusd.base.npz import check_format
 from jawusd.formats.text import parse_json, read_text
 from jawusd.geometry import LANDMARKS, rigidity_defect
@@ -37,6 +37,7 @@ class LandmarkFile:
     T_anatomical_skull: Array | None
 
 
+@errors_name_file
 def load_landmarks(path: str | os.PathLike[str]) -> LandmarkFile:
     """Read landmarks.
 
@@ -48,34 +49,30 @@ def load_landmarks(path: str | os.PathLike[str]) -> LandmarkFile:
     path = Path(path)
     data = parse_json(read_text(path, _MAX_BYTES), path)
     if not isinstance(data, dict):
-        raise FormatError("must be a JSON object.", path=path)
+        raise FormatError("must be a JSON object.")
     check_format(data.get("format"), FAMILY, VERSION, path)
     if data.get("units") != "mm":
-        raise UnitsError(f'units are "{data.get("units")}"; they must be "mm".', path=path)
+        raise UnitsError(f'units are "{data.get("units")}"; they must be "mm".')
     unknown = sorted(set(data) - {"format", "units", "landmarks", "T_anatomical_skull"})
     if unknown:
-        raise FormatError(
-            f'unknown key "{unknown[0]}"; allowed keys: format, units, landmarks, T_anatomical_skull.', path=path
-        )
+        raise FormatError(f'unknown key "{unknown[0]}"; allowed keys: format, units, landmarks, T_anatomical_skull.')
     named = data.get("landmarks")
     if not isinstance(named, dict) or set(named) != set(LANDMARKS):
-        raise FormatError(f'"landmarks" must name exactly {", ".join(LANDMARKS)}.', path=path)
-    landmarks = np.stack([_numbers(named[name], (3,), f'landmark "{name}"', path) for name in LANDMARKS])
+        raise FormatError(f'"landmarks" must name exactly {", ".join(LANDMARKS)}.')
+    landmarks = np.stack([_numbers(named[name], (3,), f'landmark "{name}"') for name in LANDMARKS])
     T = data.get("T_anatomical_skull")
     if T is not None:
-        T = _numbers(T, (4, 4), '"T_anatomical_skull"', path)
+        T = _numbers(T, (4, 4), '"T_anatomical_skull"')
         if rigidity_defect(T) > _RIGID_TOLERANCE:
-            raise FormatError('"T_anatomical_skull" must be a rigid 4 x 4 matrix.', path=path)
+            raise FormatError('"T_anatomical_skull" must be a rigid 4 x 4 matrix.')
     return LandmarkFile(landmarks, T)
 
 
-def _numbers(value: object, shape: tuple[int, ...], name: str, path: Path) -> Array:
+def _numbers(value: object, shape: tuple[int, ...], name: str) -> Array:
     try:
         array = np.array(value, dtype=np.float64)
     except (TypeError, ValueError, OverflowError) as error:
-        raise FormatError(f"{name} is not an array of numbers.", path=path) from error
+        raise FormatError(f"{name} is not an array of numbers.") from error
     if array.shape != shape or not np.isfinite(array).all():
-        raise FormatError(
-            f"{name} must consist of finite numbers, with shape {shape}; found shape {array.shape}.", path=path
-        )
+        raise FormatError(f"{name} must consist of finite numbers, with shape {shape}; found shape {array.shape}.")
     return array

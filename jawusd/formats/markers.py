@@ -24,7 +24,7 @@ from pathlib import Path
 import numpy as np
 
 from jawusd.base.arrays import Array, Mask
-from jawusd.base.errors import FormatError, UnitsError
+from jawusd.base.errors import FormatError, UnitsError, errors_name_file
 from jawusd.base.tables import read_text, split_rows, to_numbers
 from jawusd.formats.file_names import is_pattern, numbered_files
 
@@ -73,6 +73,7 @@ def mark_hidden(points: Array, zeros: bool = True) -> Array:
     return np.where(seen[..., None], points, np.nan)
 
 
+@errors_name_file
 def read_markers(path: str | os.PathLike[str]) -> MarkerTable:
     """Read marker positions from a table, or from a pattern (`Marker%d_Traj.txt`) of numbered tables of equal length.
 
@@ -87,129 +88,126 @@ def read_markers(path: str | os.PathLike[str]) -> MarkerTable:
     counts = {file.name: len(table.points) for file, table in tables.items()}
     if len(set(counts.values())) > 1:
         lengths = ", ".join(f"{name} has {count}" for name, count in counts.items())
-        raise FormatError(f"the tables have different numbers of frames: {lengths}.", path=path)
+        raise FormatError(f"the tables have different numbers of frames: {lengths}.")
     first, *_ = tables.values()
     if len({(table.unit, table.fps) for table in tables.values()}) > 1:
-        raise FormatError("the tables have different units or rates.", path=path)
+        raise FormatError("the tables have different units or rates.")
     points = np.concatenate([table.points for table in tables.values()], axis=1)
     return MarkerTable(points, sum((table.names for table in tables.values()), ()), first.unit, first.fps)
 
 
+@errors_name_file
 def _read_table(path: Path) -> MarkerTable:
     kind = _NOT_READ.get(path.suffix.lower())
     if kind is not None:
-        raise FormatError(f"is {kind}, not a supported marker table.", path=path, hint=READ)
-    rows, separator = split_rows(read_text(path, _MAX_BYTES), path, blank_rows=True)
+        raise FormatError(f"is {kind}, not a supported marker table.", hint=READ)
+    rows, separator = split_rows(read_text(path, _MAX_BYTES), blank_rows=True)
     if not rows:
-        raise FormatError("has no frames.", path=path)
+        raise FormatError("has no frames.")
     if max(len(row) for _, row in rows) == 1:  # a table whose columns are separated only by spaces
         rows = [(line, row[0].split()) for line, row in rows]
     keys = [row[0].strip().lower() for _, row in rows]
     if "marker_names" in keys or "data_included" in keys:
-        return _read_qtm(rows, path)
+        return _read_qtm(rows)
     if "frame#" in keys:
-        return _read_trc(rows, keys.index("frame#"), path)
+        return _read_trc(rows, keys.index("frame#"))
     if "trajectories" in keys:
-        return _read_vicon(rows[keys.index("trajectories") :], path)
+        return _read_vicon(rows[keys.index("trajectories") :])
     sections = [row[0].strip() for _, row in rows if row[0].strip().lower() in ("model outputs", "devices", "joints")]
     if sections or keys[0] == "format version":
         what = f"has the sections {', '.join(sections)} of Vicon Nexus" if sections else "is a CSV of OptiTrack Motive"
-        raise FormatError(f"{what}, not a supported marker table.", path=path, hint=READ)
-    return MarkerTable(_plain(rows, separator, path))
+        raise FormatError(f"{what}, not a supported marker table.", hint=READ)
+    return MarkerTable(_plain(rows, separator))
 
 
-def _plain(rows: _Rows, separator: str, path: Path) -> Array:
+def _plain(rows: _Rows, separator: str) -> Array:
     """Return the marker positions in a table of plain numbers or an ArtiSynth probe, shape (F, N, 3)."""
     if any(len(cell.split()) > 1 for _, row in rows for cell in row):  # columns may also be separated by spaces
         rows = [(line, separator.join(row).split()) for line, row in rows]
     probe = len(rows) > 1 and rows[1][1][0].strip().lower() in _INTERPOLATIONS
     if probe:
-        width, rows = _probe_size(rows[1][1], path), rows[2:]
+        width, rows = _probe_size(rows[1][1]), rows[2:]
     else:
         width = len(rows[0][1])
     if not rows:
-        raise FormatError("has no frames.", path=path)
+        raise FormatError("has no frames.")
     if any(re.match(r"[^\W\d_]", cell.strip()) and cell.strip().lower() != "nan" for cell in rows[0][1]):
         shown = " ".join(rows[0][1])[:60]
-        raise FormatError(f'is not a table of marker positions: line {rows[0][0]} is "{shown}".', path=path, hint=READ)
+        raise FormatError(f'is not a table of marker positions: line {rows[0][0]} is "{shown}".', hint=READ)
     cells = [cell.strip() for _, row in rows for cell in row] if separator == "," else []
     if any(map(_LEADING_ZERO.fullmatch, cells)) and not any("." in cell for cell in cells):
-        raise FormatError(
-            "uses commas both as decimal and as column separators.", path=path, hint="Write decimals with points."
-        )
+        raise FormatError("uses commas both as decimal and as column separators.", hint="Write decimals with points.")
     for line, row in rows:
         if len(row) != width:
-            raise FormatError(f"line {line} has {len(row)} numbers; expected {width}.", path=path)
+            raise FormatError(f"line {line} has {len(row)} numbers; expected {width}.")
     while width % 3 and not any(row[width - 1].strip() for _, row in rows):  # remove blank columns at the end
         width -= 1
     if width % 3:
-        raise FormatError(f"has {width} numbers per frame; expected three per marker.", path=path, hint=READ)
-    return _positions(rows, 0, width, path, zeros=not probe)
+        raise FormatError(f"has {width} numbers per frame; expected three per marker.", hint=READ)
+    return _positions(rows, 0, width, zeros=not probe)
 
 
-def _positions(rows: _Rows, first: int, width: int, path: Path, zeros: bool = True) -> Array:
+def _positions(rows: _Rows, first: int, width: int, zeros: bool = True) -> Array:
     """Convert cells to positions (F, N, 3), NaN where a marker is hidden; trailing blank cells may be missing."""
     if not rows or not width:
-        raise FormatError("has no frames or no markers.", path=path)
+        raise FormatError("has no frames or no markers.")
     cells = []
     for line, row in rows:
         found = [cell if cell.strip() else "nan" for cell in row[first : first + width]]
         if len(found) % 3 or any(cell.strip() for cell in row[first + width :]):
             end = len(row) - first
-            raise FormatError(f"line {line} has {end} numbers; expected {width}.", path=path)
+            raise FormatError(f"line {line} has {end} numbers; expected {width}.")
         cells.append(found + ["nan"] * (width - len(found)))
 
     def named(i: int, j: int) -> str:
         return f"line {rows[i][0]}, marker {j // 3 + 1}, {'xyz'[j % 3]}"
 
-    return mark_hidden(to_numbers(cells, named, path).reshape(len(rows), -1, 3), zeros)
+    return mark_hidden(to_numbers(cells, named).reshape(len(rows), -1, 3), zeros)
 
 
-def _read_qtm(rows: _Rows, path: Path) -> MarkerTable:
+def _read_qtm(rows: _Rows) -> MarkerTable:
     """Read 3D data in TSV of Qualisys Track Manager."""
     keys = {row[0].strip().upper(): [cell.strip() for cell in row[1:] if cell.strip()] for _, row in rows[:40]}
     included = "".join(keys.get("DATA_INCLUDED", ["3D"])[:1])
     if included != "3D" or "MARKER_NAMES" not in keys:
-        raise FormatError(f"contains {included} data from Qualisys Track Manager, not markers.", path=path, hint=READ)
+        raise FormatError(f"contains {included} data from Qualisys Track Manager, not markers.", hint=READ)
     names = tuple(keys["MARKER_NAMES"])
-    count = _whole(keys.get("NO_OF_MARKERS"), len(names), "NO_OF_MARKERS", path)
+    count = _whole(keys.get("NO_OF_MARKERS"), len(names), "NO_OF_MARKERS")
     if count != len(names):
-        raise FormatError(f"declares {count} markers but names {len(names)}.", path=path)
+        raise FormatError(f"declares {count} markers but names {len(names)}.")
     data = [(line, row) for line, row in rows if _is_number_or_blank(row[0])]
     header = next((row for _, row in rows if row[0].strip().lower() == "frame"), [])
     first = [cell.strip().lower() in ("frame", "time") for cell in header[:2]].count(True)
     if not header:  # skip extra columns at the beginning, which are frame and time
         filled = max((k + 1 for _, row in data for k, cell in enumerate(row) if cell.strip()), default=0)
         first = max(filled - 3 * count, 0)
-    points = _positions(data, first, 3 * count, path)
-    _check_count(_whole(keys.get("NO_OF_FRAMES"), len(data), "NO_OF_FRAMES", path), len(data), path)
-    fps = _rate(keys.get("FREQUENCY"), "FREQUENCY", path)
+    points = _positions(data, first, 3 * count)
+    _check_count(_whole(keys.get("NO_OF_FRAMES"), len(data), "NO_OF_FRAMES"), len(data))
+    fps = _rate(keys.get("FREQUENCY"), "FREQUENCY")
     return MarkerTable(points, names, "mm", fps)
 
 
-def _read_trc(rows: _Rows, at: int, path: Path) -> MarkerTable:
+def _read_trc(rows: _Rows, at: int) -> MarkerTable:
     """Read a TRC file; `at` is the index of the row that names the markers."""
     keys: dict[str, list[str]] = {}
     for (_, above), (_, below) in zip(rows[:at], rows[1:at]):
         if above[0].strip().lower() == "datarate":
             keys = {key.strip().lower(): [value.strip()] for key, value in zip(above, below)}
     names = tuple(cell.strip() for cell in rows[at][1][2:] if cell.strip())
-    count = _whole(keys.get("nummarkers"), len(names), "NumMarkers", path)
+    count = _whole(keys.get("nummarkers"), len(names), "NumMarkers")
     if count != len(names):
-        raise FormatError(f"declares {count} markers but names {len(names)}.", path=path)
+        raise FormatError(f"declares {count} markers but names {len(names)}.")
     data = [(line, row) for line, row in rows[at + 1 :] if row[0].strip() and row[0].strip().lower() != "x1"]
-    points = _positions(data, 2, 3 * count, path)
-    _check_count(_whole(keys.get("numframes"), len(data), "NumFrames", path), len(data), path)
+    points = _positions(data, 2, 3 * count)
+    _check_count(_whole(keys.get("numframes"), len(data), "NumFrames"), len(data))
     unit = "".join(keys.get("units", []))
-    return MarkerTable(
-        _with_gaps(data, points, path), names, length_unit(unit, path), _rate(keys.get("datarate"), "", path)
-    )
+    return MarkerTable(_with_gaps(data, points), names, length_unit(unit), _rate(keys.get("datarate"), ""))
 
 
-def _read_vicon(rows: _Rows, path: Path) -> MarkerTable:
+def _read_vicon(rows: _Rows) -> MarkerTable:
     """Read the section Trajectories of a Vicon Nexus CSV: title, rate, names, columns, units, then frames."""
     if len(rows) < 5:
-        raise FormatError("its section Trajectories has no frames.", path=path)
+        raise FormatError("its section Trajectories has no frames.")
     named, columns, units = ([cell.strip() for cell in row] for _, row in rows[2:5])
     data = []
     for line, row in rows[5:]:
@@ -220,29 +218,25 @@ def _read_vicon(rows: _Rows, path: Path) -> MarkerTable:
         k for k, name in enumerate(named) if name and [cell.upper() for cell in columns[k : k + 3]] == ["X", "Y", "Z"]
     ]
     if not places or not data:
-        raise FormatError("its section Trajectories has no markers or no frames.", path=path)
+        raise FormatError("its section Trajectories has no markers or no frames.")
     found = {units[k].lower() for k in places if k < len(units)}
     if len(found) != 1:
-        raise FormatError(f"its markers have the units {', '.join(sorted(found))}; expected one unit.", path=path)
-    points = np.concatenate(
-        [_positions([(line, row[k : k + 3]) for line, row in data], 0, 3, path) for k in places], axis=1
-    )
+        raise FormatError(f"its markers have the units {', '.join(sorted(found))}; expected one unit.")
+    points = np.concatenate([_positions([(line, row[k : k + 3]) for line, row in data], 0, 3) for k in places], axis=1)
     names = tuple(named[k] for k in places)
-    return MarkerTable(
-        _with_gaps(data, points, path), names, length_unit(found.pop(), path), _rate(rows[1][1], "", path)
-    )
+    return MarkerTable(_with_gaps(data, points), names, length_unit(found.pop()), _rate(rows[1][1], ""))
 
 
-def _with_gaps(data: _Rows, points: Array, path: Path) -> Array:
+def _with_gaps(data: _Rows, points: Array) -> Array:
     """Return positions with rows of NaN for frame numbers missing in the first column."""
-    numbers = to_numbers([row[:1] for _, row in data], lambda i, _: f"line {data[i][0]}, frame", path)[:, 0]
+    numbers = to_numbers([row[:1] for _, row in data], lambda i, _: f"line {data[i][0]}, frame")[:, 0]
     steps = np.diff(numbers)
     if (steps < 1).any() or (numbers % 1 != 0).any():
         line = data[int(np.argmax(steps < 1)) + 1][0]
-        raise FormatError(f"line {line}: frames must be increasing whole numbers.", path=path)
+        raise FormatError(f"line {line}: frames must be increasing whole numbers.")
     rows = (numbers - numbers[:1]).astype(np.int64)
     if rows.size and rows[-1] >= _MOST_FRAMES:
-        raise FormatError(f"spans {rows[-1] + 1} frames; at most {_MOST_FRAMES} are allowed.", path=path)
+        raise FormatError(f"spans {rows[-1] + 1} frames; at most {_MOST_FRAMES} are allowed.")
     whole = np.full((int(rows.max(initial=-1)) + 1, *points.shape[1:]), np.nan)
     whole[rows] = points
     return whole
@@ -252,34 +246,33 @@ def _is_number_or_blank(cell: str) -> bool:
     return not cell.strip() or cell.strip().lower() == "nan" or not re.match(r"[^\W\d]", cell.strip())
 
 
-def _check_count(said: int, found: int, path: Path) -> None:
+def _check_count(said: int, found: int) -> None:
     if found != said:
         raise FormatError(
             f"is truncated or was edited: its header declares {said} frames, but it has {found}.",
-            path=path,
             hint="Export it again, or correct the number in its header.",
         )
 
 
-def _whole(cells: list[str] | None, default: int, key: str, path: Path) -> int:
+def _whole(cells: list[str] | None, default: int, key: str) -> int:
     if not cells:
         return default
-    value = to_numbers([cells[:1]], lambda *_: key, path)[0, 0]
+    value = to_numbers([cells[:1]], lambda *_: key)[0, 0]
     if value % 1 != 0 or not 0 <= value <= _MOST_FRAMES:
-        raise FormatError(f"{key} is {cells[0]}; expected a whole number from 0 to {_MOST_FRAMES}.", path=path)
+        raise FormatError(f"{key} is {cells[0]}; expected a whole number from 0 to {_MOST_FRAMES}.")
     return int(value)
 
 
-def _rate(cells: list[str] | None, key: str, path: Path) -> float | None:
+def _rate(cells: list[str] | None, key: str) -> float | None:
     if not cells:
         return None
-    value = float(to_numbers([cells[:1]], lambda *_: key or "the rate", path)[0, 0])
+    value = float(to_numbers([cells[:1]], lambda *_: key or "the rate")[0, 0])
     if not 0 < value < np.inf:
-        raise FormatError(f"{key or 'the rate'} is {cells[0]}; it must be greater than 0 per second.", path=path)
+        raise FormatError(f"{key or 'the rate'} is {cells[0]}; it must be greater than 0 per second.")
     return value
 
 
-def length_unit(unit: str, path: Path) -> str | None:
+def length_unit(unit: str) -> str | None:
     """Return a length unit in lower case, or None if it is empty.
 
     Raises:
@@ -287,16 +280,15 @@ def length_unit(unit: str, path: Path) -> str | None:
     """
     unit = unit.strip()
     if unit and unit.lower() not in _LENGTHS:
-        raise UnitsError(f'lengths are in "{unit}"; the unit must be one of {", ".join(_LENGTHS)}.', path=path)
+        raise UnitsError(f'lengths are in "{unit}"; the unit must be one of {", ".join(_LENGTHS)}.')
     return unit.lower() or None
 
 
-def _probe_size(row: list[str], path: Path) -> int:
+def _probe_size(row: list[str]) -> int:
     """Return the number of values per frame of an ArtiSynth probe."""
     try:
         return int(row[1])
     except (IndexError, ValueError) as error:
         raise FormatError(
-            'line 2 must be like "Linear 9 0.02" in an ArtiSynth probe (interpolation, numbers per frame, step).',
-            path=path,
+            'line 2 must be like "Linear 9 0.02" in an ArtiSynth probe (interpolation, numbers per frame, step).'
         ) from error

@@ -142,12 +142,12 @@ def read_mesh_bytes(path: Path) -> bytes:
     size = path.stat().st_size
     if size > MOST_BYTES:
         raise CaptureError(
-            f"is {size:,} bytes long; at most {MOST_BYTES:,} bytes are allowed.", path=path, hint="Decimate the mesh."
+            f"is {size:,} bytes long; at most {MOST_BYTES:,} bytes are allowed.", hint="Decimate the mesh."
         )
     return path.read_bytes()
 
 
-def check_count(path: Path, count: int, what: str) -> None:
+def check_count(count: int, what: str) -> None:
     """Check the number of "vertices", "triangles" or "faces" of a file before reading them.
 
     Raises:
@@ -155,12 +155,12 @@ def check_count(path: Path, count: int, what: str) -> None:
     """
     most = MOST_VERTICES if what == "vertices" else MOST_TRIANGLES
     if count > most:
-        raise CaptureError(f"has {count:,} {what}; at most {most:,} are allowed.", path=path, hint="Decimate the mesh.")
+        raise CaptureError(f"has {count:,} {what}; at most {most:,} are allowed.", hint="Decimate the mesh.")
 
 
-def cut_off(path: Path, found: int, said: int, what: str) -> CaptureError:
+def cut_off(found: int, said: int, what: str) -> CaptureError:
     """Return the error for a truncated file."""
-    return CaptureError(f"is truncated: it has {found} of {said} {what}.", path=path, hint=COPY_AGAIN)
+    return CaptureError(f"is truncated: it has {found} of {said} {what}.", hint=COPY_AGAIN)
 
 
 def byte_colors(values: Array) -> NDArray[np.uint8] | None:

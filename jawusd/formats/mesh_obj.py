@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from jawusd.base.arrays import Array
-from jawusd.base.errors import CaptureError
+from jawusd.base.errors import CaptureError, errors_name_file
 from jawusd.formats.mesh import (
     COPY_AGAIN,
     Indices,
@@ -33,6 +33,7 @@ _COUNTED = re.compile(r"^#\s*Faces:\s*(\d+)\s*$", re.MULTILINE | re.IGNORECASE)
 _LEAST_LOOSE = 0.1
 
 
+@errors_name_file
 def read_obj(path: Path) -> MeshData:
     """Read an OBJ file; vertices and faces keep the file's order.
 
@@ -60,27 +61,27 @@ def read_obj(path: Path) -> MeshData:
                 relative.append((len(corners), len(points), len(places)))
             counts.append(len(words) - 1)
             corners += words[1:]
-    check_count(path, len(points), "vertices")
-    check_count(path, sum(counts) - 2 * len(counts), "triangles")
-    vertices, colors = _points(path, points)
-    at, texture = _indices(path, corners, counts, relative)
+    check_count(len(points), "vertices")
+    check_count(sum(counts) - 2 * len(counts), "triangles")
+    vertices, colors = _points(points)
+    at, texture = _indices(corners, counts, relative)
     placed, faces = cut_polygons(vertices, np.array(counts, np.int64), at)
-    _check_whole(path, text, len(counts), vertices, faces)
-    return MeshData(vertices, faces, colors, _uv(path, places, texture, placed))
+    _check_whole(text, len(counts), vertices, faces)
+    return MeshData(vertices, faces, colors, _uv(places, texture, placed))
 
 
-def _points(path: Path, rows: list[list[str]]) -> tuple[Array, np.typing.NDArray[np.uint8] | None]:
+def _points(rows: list[list[str]]) -> tuple[Array, np.typing.NDArray[np.uint8] | None]:
     """Return vertices (V, 3) and, if there are any, vertex colours; vertices without a colour are gray."""
-    vertices = _numbers(path, [row[:3] for row in rows], 3)
+    vertices = _numbers([row[:3] for row in rows], 3)
     coloured = [k for k, row in enumerate(rows) if len(row) >= 6]
     if not coloured:
         return vertices, None
     colors = np.full((len(rows), 3), np.nan)
-    colors[coloured] = _numbers(path, [rows[k][3:6] for k in coloured], 3)
+    colors[coloured] = _numbers([rows[k][3:6] for k in coloured], 3)
     return vertices, byte_colors(colors)
 
 
-def _numbers(path: Path, rows: list[list[str]], columns: int) -> Array:
+def _numbers(rows: list[list[str]], columns: int) -> Array:
     try:
         values = np.fromiter(map(float, chain.from_iterable(rows)), np.float64)
         if len(values) == columns * len(rows):
@@ -89,12 +90,12 @@ def _numbers(path: Path, rows: list[list[str]], columns: int) -> Array:
         pass
     for row in rows:
         if len(row) < columns or not all(_NUMBER.fullmatch(word) for word in row):
-            raise _wrong(path, f"v {' '.join(row)}", f"{columns} numbers")
+            raise _wrong(f"v {' '.join(row)}", f"{columns} numbers")
     raise ValueError("a number cannot be read")
 
 
 def _indices(
-    path: Path, corners: list[str], counts: list[int], relative: list[tuple[int, int, int]]
+    corners: list[str], counts: list[int], relative: list[tuple[int, int, int]]
 ) -> tuple[Indices, Indices | None]:
     """Return the vertex index and, if all corners have one, the texture index of each corner (C,), from 0."""
     texture = None
@@ -108,7 +109,7 @@ def _indices(
             at = np.fromiter(map(int, corners), np.int64, len(corners))
     except ValueError as error:
         bad = next(corner for corner in corners if not re.fullmatch(r"-?\d+(?:/(?:-?\d+)?){0,2}", corner))
-        raise _wrong(path, f"f ... {bad}", "indices such as 12, 12/7, 12/7/9 or 12//9") from error
+        raise _wrong(f"f ... {bad}", "indices such as 12, 12/7, 12/7/9 or 12//9") from error
     length = np.array(counts, np.int64)
     owner = np.repeat(np.arange(len(counts)), length)
     before = np.zeros((2, len(counts)), np.int64)
@@ -119,34 +120,33 @@ def _indices(
     out = []
     for values, counted in zip((at, texture), before, strict=True):
         if values is not None and (values == 0).any():
-            raise _wrong(path, f"f ... {corners[int(np.flatnonzero(values == 0)[0])]}", "indices other than 0")
+            raise _wrong(f"f ... {corners[int(np.flatnonzero(values == 0)[0])]}", "indices other than 0")
         out.append(None if values is None else np.where(values > 0, values - 1, counted[owner] + values))
     return np.asarray(out[0], np.int64), out[1]
 
 
-def _uv(path: Path, rows: list[list[str]], texture: Indices | None, placed: Indices) -> Array | None:
+def _uv(rows: list[list[str]], texture: Indices | None, placed: Indices) -> Array | None:
     if texture is None or not rows or not all(len(row) == 2 for row in rows):
         return None
     if ((texture < 0) | (texture >= len(rows))).any():
         return None
-    uv = _numbers(path, rows, 2)[texture[placed]]
+    uv = _numbers(rows, 2)[texture[placed]]
     return uv if np.isfinite(uv).all() else None
 
 
-def _check_whole(path: Path, text: str, polygons: int, vertices: Array, faces: Indices) -> None:
+def _check_whole(text: str, polygons: int, vertices: Array, faces: Indices) -> None:
     """Raise an error if a file is truncated within the faces."""
     declared = _COUNTED.findall(text)
     if len(declared) == 1 and int(declared[0]) > polygons:
-        raise cut_off(path, polygons, int(declared[0]), "faces")
+        raise cut_off(polygons, int(declared[0]), "faces")
     used = len(np.unique(faces[(faces >= 0) & (faces < len(vertices))]))
     if not text.endswith("\n") and used < (1 - _LEAST_LOOSE) * len(vertices) and polygons:
         raise CaptureError(
             f"is truncated after {polygons} faces: it ends within a line, and {len(vertices) - used} of "
             f"{len(vertices)} vertices have no face.",
-            path=path,
             hint=COPY_AGAIN,
         )
 
 
-def _wrong(path: Path, found: str, allowed: str) -> CaptureError:
-    return CaptureError(f'the line "{found:.60}" must have {allowed}.', path=path, hint="Export the mesh again.")
+def _wrong(found: str, allowed: str) -> CaptureError:
+    return CaptureError(f'the line "{found:.60}" must have {allowed}.', hint="Export the mesh again.")

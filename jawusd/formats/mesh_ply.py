@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jawusd.base.arrays import Array
-from jawusd.base.errors import CaptureError
+from jawusd.base.errors import CaptureError, errors_name_file
 from jawusd.formats.mesh import (
     Indices,
     MeshData,
@@ -70,6 +70,7 @@ class _Table:
         return None, ""
 
 
+@errors_name_file
 def read_ply(path: Path) -> MeshData:
     """Read a PLY file; vertices and faces keep the file's order.
 
@@ -77,10 +78,10 @@ def read_ply(path: Path) -> MeshData:
         CaptureError: the file is truncated, or header and data do not match.
     """
     data = read_mesh_bytes(path)
-    elements, at, order = _header(path, data)
+    elements, at, order = _header(data)
     for element in elements:
         if element.name in ("vertex", "face"):
-            check_count(path, element.rows, _plural(element))
+            check_count(element.rows, _plural(element))
     text, wrong = b"", None
     if not order:
         text = data[at:]
@@ -89,22 +90,22 @@ def read_ply(path: Path) -> MeshData:
     tables: dict[str, _Table] = {}
     try:
         for element in elements:
-            tables[element.name], at = _Reader(path, element, order).read(data, at)
+            tables[element.name], at = _Reader(element, order).read(data, at)
     except CaptureError as error:
         if wrong is None:
             raise
-        raise CaptureError(f'"{wrong:.60}" is not a number.', path=path, hint="Export the mesh again.") from error
+        raise CaptureError(f'"{wrong:.60}" is not a number.', hint="Export the mesh again.") from error
     if at < len(data) and not order:
-        _check_columns(path, text, sum(element.rows for element in elements), at // 8)
-    return _mesh(path, tables)
+        _check_columns(text, sum(element.rows for element in elements), at // 8)
+    return _mesh(tables)
 
 
-def _mesh(path: Path, tables: dict[str, _Table]) -> MeshData:
+def _mesh(tables: dict[str, _Table]) -> MeshData:
     none = _Table({}, {}, {})
     points, faces, strips = (tables.get(name, none) for name in ("vertex", "face", "tristrips"))
     vertices, _ = points.joined((("x", "y", "z"),))
     if vertices is None:
-        raise CaptureError("its vertices do not have three coordinates each.", path=path, hint="Export it again.")
+        raise CaptureError("its vertices do not have three coordinates each.", hint="Export it again.")
     vertices = vertices.astype(np.float64)
     name = next((name for name in (*_CORNERS, *faces.lists) if name in faces.lists), "")
     counts, corners = faces.lists.get(name, (np.zeros(0, np.int64), np.zeros(0)))
@@ -114,7 +115,7 @@ def _mesh(path: Path, tables: dict[str, _Table]) -> MeshData:
         uv = faces.lists["texcoord"][1].astype(np.float64).reshape(-1, 2)[placed]
     for _, values in strips.lists.values():
         triangles, uv = np.concatenate([triangles, _strip_triangles(values.astype(np.int64))]), None
-    check_count(path, len(triangles), "triangles")
+    check_count(len(triangles), "triangles")
     places, _ = points.joined(_PLACES)
     if uv is None and places is not None and ((triangles >= 0) & (triangles < len(vertices))).all():
         uv = places.astype(np.float64)[triangles]
@@ -136,11 +137,11 @@ def _strip_triangles(values: Indices) -> Indices:
     return corners[(corners >= 0).all(axis=1) & (a != b) & (b != c) & (c != a)]
 
 
-def _header(path: Path, data: bytes) -> tuple[list[_Element], int, str]:
+def _header(data: bytes) -> tuple[list[_Element], int, str]:
     """Return the elements, the offset of their data, and the byte order ("" for text)."""
     found = _END.search(data)
     if data.removeprefix(b"\xef\xbb\xbf")[:3].lower() != b"ply" or found is None:
-        raise CaptureError('is not a PLY file: "ply" or "end_header" is missing.', path=path, hint="Export it again.")
+        raise CaptureError('is not a PLY file: "ply" or "end_header" is missing.', hint="Export it again.")
     elements: list[_Element] = []
     order: str | None = None
     for line in data[: found.start()].decode("utf-8", errors="replace").splitlines():
@@ -155,15 +156,15 @@ def _header(path: Path, data: bytes) -> tuple[list[_Element], int, str]:
             elif words[:1] == ["property"]:
                 elements[-1].properties.append(_Property(words[2], _TYPES[words[1]]))
         except (KeyError, ValueError, IndexError) as error:
-            raise _bad_header(path, f'has the line "{line:.60}", which is not PLY') from error
+            raise _bad_header(f'has the line "{line:.60}", which is not PLY') from error
     names = [element.name for element in elements]
     if order is None or len(set(names)) < len(names) or any(element.rows < 0 for element in elements):
-        raise _bad_header(path, 'lacks "format", repeats an element, or has a negative count')
+        raise _bad_header('lacks "format", repeats an element, or has a negative count')
     return elements, found.end(), order
 
 
-def _bad_header(path: Path, what: str) -> CaptureError:
-    return CaptureError(f"its header {what}.", path=path, hint="Export the mesh again.")
+def _bad_header(what: str) -> CaptureError:
+    return CaptureError(f"its header {what}.", hint="Export the mesh again.")
 
 
 def _plural(element: _Element) -> str:
@@ -187,19 +188,19 @@ def _numbers(text: bytes) -> tuple[Array, str | None]:
         return np.fromiter(map(float, words[:whole]), np.float64, whole), shown
 
 
-def _check_columns(path: Path, text: bytes, rows: int, used: int) -> None:
+def _check_columns(text: bytes, rows: int, used: int) -> None:
     """Raise an error if lines of a text file have more numbers than the header declares; extra lines are ignored."""
     lines = [line for line in text.splitlines() if line.strip()][:rows]
     held = sum(len(line.split()) for line in lines)
     if len(lines) == rows and held != used:
-        raise _bad_header(path, f"declares {used} numbers in {rows} lines, but the lines contain {held}")
+        raise _bad_header(f"declares {used} numbers in {rows} lines, but the lines contain {held}")
 
 
 class _Reader:
     """Reader of one element; reads all rows at once if their lists have equal lengths."""
 
-    def __init__(self, path: Path, element: _Element, order: str) -> None:
-        self._path, self._element = path, element
+    def __init__(self, element: _Element, order: str) -> None:
+        self._element = element
         # numbers in text files are read as doubles
         self._values = [(order + one.value if order else "<f8") for one in element.properties]
         self._lengths = [one.length and (order + one.length if order else "<f8") for one in element.properties]
@@ -212,7 +213,8 @@ class _Reader:
         first = self._walk(data, at, 1)[1]
         kind = self._row_type(first[0].tolist())
         alike = np.frombuffer(data, kind, min(rows, (len(data) - at) // kind.itemsize), at)
-        if len(alike) == rows and all((alike[f"n{k}"] == alike[f"n{k}"][0]).all() for k in self._listed()):
+        lengths = [alike[f"n{k}"] for k, length in enumerate(self._lengths) if length]
+        if len(alike) == rows and all((length == length[0]).all() for length in lengths):
             return self._table([(np.arange(rows), alike)], np.repeat(first, rows, axis=0)), at + rows * kind.itemsize
         if not listed:
             raise self._cut_off(len(alike))
@@ -224,11 +226,8 @@ class _Reader:
             groups.append((owner, raw[starts[owner, None] + np.arange(kind.itemsize)].view(kind)[:, 0]))
         return self._table(groups, counts), int(starts[-1])
 
-    def _listed(self) -> list[int]:
-        return [k for k, length in enumerate(self._lengths) if length]
-
     def _cut_off(self, whole: int) -> CaptureError:
-        return cut_off(self._path, whole, self._element.rows, _plural(self._element))
+        return cut_off(whole, self._element.rows, _plural(self._element))
 
     def _row_type(self, counts: list[int]) -> np.dtype[np.void]:
         """Return the dtype of rows with given list lengths: fields "p0", "p1", ..., list lengths "n0", "n1", ..."""
@@ -253,7 +252,7 @@ class _Reader:
                     raise self._cut_off(row)
                 (count,) = length.unpack_from(data, at)
                 if not count >= 0 or count % 1:
-                    raise _bad_header(self._path, f"does not match the data: a list has {count:g} values")
+                    raise _bad_header(f"does not match the data: a list has {count:g} values")
                 counts.append(int(count))
                 at += length.size + int(count) * size
             if at > len(data):

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from jawusd.base.arrays import Array
-from jawusd.base.errors import CaptureError
+from jawusd.base.errors import CaptureError, errors_name_file
 from jawusd.formats.mesh import COPY_AGAIN, MOST_TRIANGLES, MeshData, check_count, cut_off, read_mesh_bytes
 
 _HEADER = 84
@@ -23,6 +23,7 @@ _SOLID = re.compile(rb"\n[ \t]*(end)?solid\b[^\n]*")
 _VERTEX = re.compile(rb"vertex\s+(\S+)\s+(\S+)\s+(\S+)")
 
 
+@errors_name_file
 def read_stl(path: Path) -> MeshData:
     """Read an STL file, with three vertices per triangle.
 
@@ -32,29 +33,28 @@ def read_stl(path: Path) -> MeshData:
     data = read_mesh_bytes(path)
     begins_as_text = data[:512].removeprefix(b"\xef\xbb\xbf").lstrip()[:5].lower() == b"solid"
     # A binary header may also start with "solid", but its triangle count contains a zero byte, which text does not.
-    corners = _text(path, data) if begins_as_text and 0 not in data[80:_HEADER] else _binary(path, data)
+    corners = _text(data) if begins_as_text and 0 not in data[80:_HEADER] else _binary(data)
     return MeshData(corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3))
 
 
-def _binary(path: Path, data: bytes) -> Array:
+def _binary(data: bytes) -> Array:
     if len(data) < _HEADER:
-        raise CaptureError("is neither a text nor a binary STL file.", path=path, hint="Export it again.")
+        raise CaptureError("is neither a text nor a binary STL file.", hint="Export it again.")
     said = int.from_bytes(data[_HEADER - 4 : _HEADER], "little")
     whole = (len(data) - _HEADER) // _TRIANGLE.itemsize
     # The program that wrote the file did not know the count, or the file is not STL.
     if said > max(whole, MOST_TRIANGLES):
         raise CaptureError(
             f"declares {said:,} triangles, but has room for {whole:,}.",
-            path=path,
             hint="Export it again, with the suffix of its format.",
         )
     if said > whole:
-        raise cut_off(path, whole, said, "triangles")
-    check_count(path, said, "triangles")
+        raise cut_off(whole, said, "triangles")
+    check_count(said, "triangles")
     rows = np.frombuffer(data, _TRIANGLE, whole, _HEADER)["corners"].astype(np.float64)
     more = int(_are_triangles(rows[said:]).sum())
     if more:
-        raise CaptureError(f"declares {said} triangles, but {more} more follow.", path=path, hint="Export it again.")
+        raise CaptureError(f"declares {said} triangles, but {more} more follow.", hint="Export it again.")
     return rows[:said]
 
 
@@ -66,18 +66,18 @@ def _are_triangles(corners: Array) -> np.typing.NDArray[np.bool_]:
     return np.asarray(lengths & (np.abs(area) > 0).any(axis=1))
 
 
-def _text(path: Path, data: bytes) -> Array:
+def _text(data: bytes) -> Array:
     data = (b"\n" + data.removeprefix(b"\xef\xbb\xbf")).lower().replace(b"\r", b"\n")
     ends = [bool(word) for word in _SOLID.findall(data)]
     body = _SOLID.sub(b"", data)  # remove names of solids, which may contain keywords
     whole = body.count(b"endfacet")
     facets = body.count(b"facet") - whole
-    check_count(path, facets, "triangles")
+    check_count(facets, "triangles")
     if facets != whole or ends.count(True) != ends.count(False):
-        raise CaptureError(f'is truncated after {whole} triangles: "endsolid" is missing.', path=path, hint=COPY_AGAIN)
+        raise CaptureError(f'is truncated after {whole} triangles: "endsolid" is missing.', hint=COPY_AGAIN)
     rows = _VERTEX.findall(body)
     if len(rows) != 3 * facets:
         raise CaptureError(
-            f"has {len(rows)} vertices in {facets} facets; each facet needs three.", path=path, hint="Export it again."
+            f"has {len(rows)} vertices in {facets} facets; each facet needs three.", hint="Export it again."
         )
     return np.fromiter(map(float, chain.from_iterable(rows)), np.float64).reshape(-1, 3, 3)

@@ -24,8 +24,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jawusd.base.arrays import Array
-from jawusd.base.errors import FormatError
-from jawusd.base.tables import TextTable, read_table, read_text
+from jawusd.base.errors import FormatError, errors_name_file
+from jawusd.base.tables import TextTable, is_number, read_table, read_text
 from jawusd.formats.atomic import write_text_atomic
 from jawusd.formats.text import parse_json
 from jawusd.geometry import make_transform, matrix_from_wxyz, rigidity_defect
@@ -45,28 +45,16 @@ _JOINT_COLUMNS = "shape,weight,d1,d2,d3,tx,ty,tz,rx_deg,ry_deg,rz_deg,qw,qx,qy,q
 
 
 def _read_table(path: Path) -> TextTable:
-    if path.suffix.lower() != ".json":
-        table = read_table(path, _MAX_BYTES)
-    else:
-        table = _json_table(path)
+    table = _json_table(path) if path.suffix.lower() == ".json" else read_table(path, _MAX_BYTES)
     named = [name for name in table.header if name]
-    if named and all(map(_is_number, named)):
+    if named and all(map(is_number, named)):
         raise FormatError(
             f"has numbers in its first line: {', '.join(named):.{_SHOWN}}.",
-            path=path,
             hint="The first line must name the columns, such as frame, d1, d2, d3.",
         )
     if len(set(named)) != len(named):
-        raise FormatError(f"has a duplicate column: {', '.join(named)}.", path=path)
+        raise FormatError(f"has a duplicate column: {', '.join(named)}.")
     return table
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
 
 
 def _header_hint(table: TextTable) -> str:
@@ -89,15 +77,15 @@ def _json_table(path: Path) -> TextTable:
     records = parse_json(read_text(path, _MAX_BYTES), path)
     if not isinstance(records, list) or not all(isinstance(record, dict) for record in records):
         what = 'a list with an object for each frame, such as [{"frame": 1, "d1": 20, "d2": 2, "d3": 1}]'
-        raise FormatError(f"must be {what}, or keys: {KEYS_EXAMPLE}.", path=path)
+        raise FormatError(f"must be {what}, or keys: {KEYS_EXAMPLE}.")
     if not records:
-        raise FormatError("is empty.", path=path)
+        raise FormatError("is empty.")
     names = list(records[0])
     for index, record in enumerate(records, start=1):
         if set(record) != set(names):
-            raise FormatError(f"record {index} has different keys from the first one.", path=path)
+            raise FormatError(f"record {index} has different keys from the first one.")
     rows = [[str(record[name]) for name in names] for record in records]
-    return TextTable(path, names, rows, [f"record {index}" for index in range(1, len(rows) + 1)])
+    return TextTable(names, rows, [f"record {index}" for index in range(1, len(rows) + 1)])
 
 
 def _numbers(table: TextTable, names: tuple[str, ...]) -> Array:
@@ -109,7 +97,6 @@ def _numbers(table: TextTable, names: tuple[str, ...]) -> Array:
         i, j = bad[0]
         raise FormatError(
             f"{table.named(i, columns[j])} is {table.rows[i][columns[j]]}; all values must be finite.",
-            path=table.path,
             hint="Omit frames without a pose.",
         )
     return out
@@ -119,14 +106,12 @@ def _frames(table: TextTable, name: str) -> NDArray[np.int64]:
     if name not in table.header:
         timed = {"time", "timecode", "seconds"} & {column.lower() for column in table.header}
         hint = "Number the rows in a column frame, instead of giving times." if timed else None
-        raise FormatError(f'has no column "{name}"; it has {_listed(table)}.', path=table.path, hint=hint)
+        raise FormatError(f'has no column "{name}"; it has {_listed(table)}.', hint=hint)
     values = _numbers(table, (name,))[:, 0]
     uneven = np.flatnonzero((values != np.round(values)) | (np.abs(values) > 2**53))
     if uneven.size:
         row, column = int(uneven[0]), table.header.index(name)
-        raise FormatError(
-            f"{table.named(row, column)} is {table.rows[row][column]}; frames must be whole numbers.", path=table.path
-        )
+        raise FormatError(f"{table.named(row, column)} is {table.rows[row][column]}; frames must be whole numbers.")
     return values.astype(np.int64)
 
 
@@ -134,6 +119,7 @@ def _listed(table: TextTable) -> str:
     return ", ".join(name for name in table.header if name) or "none"
 
 
+@errors_name_file
 def read_poses(
     path: str | os.PathLike[str], columns: Mapping[str, str] | None = None
 ) -> tuple[NDArray[np.int64], Array]:
@@ -148,6 +134,7 @@ def read_poses(
     return _poses_of(_read_table(Path(path)), columns)
 
 
+@errors_name_file
 def read_poses_or_parameters(path: str | os.PathLike[str]) -> tuple[NDArray[np.int64], Array]:
     """Read frame numbers (F,), and parameters d [mm] (F, 3) or T_skull_mandible (F, 4, 4), from CSV or JSON.
 
@@ -162,7 +149,6 @@ def read_poses_or_parameters(path: str | os.PathLike[str]) -> tuple[NDArray[np.i
             f"has neither the columns {', '.join(PARAMETER_COLUMNS)} nor those of poses, "
             f"{MATRIX_COLUMNS[0]} ... {MATRIX_COLUMNS[11]} or {', '.join(QUATERNION_COLUMNS)}; "
             f"it has {_listed(table)}.",
-            path=table.path,
             hint=_header_hint(table),
         )
     return _poses_of(table, None)
@@ -172,9 +158,7 @@ def _poses_of(table: TextTable, columns: Mapping[str, str] | None) -> tuple[NDAr
     called = {name: name for name in ("frame", *MATRIX_COLUMNS, *QUATERNION_COLUMNS)} | dict(columns or {})
     for name, theirs in (columns or {}).items():
         if theirs not in table.header:
-            raise FormatError(
-                f'has no column "{theirs}" to read as "{name}"; it has {_listed(table)}.', path=table.path
-            )
+            raise FormatError(f'has no column "{theirs}" to read as "{name}"; it has {_listed(table)}.')
     if columns and called["frame"] not in table.header:
         frames = np.arange(len(table.rows))
     else:
@@ -188,13 +172,12 @@ def _poses_of(table: TextTable, columns: Mapping[str, str] | None) -> tuple[NDAr
         values = _numbers(table, quaternion)
         norm = np.linalg.norm(values[:, 3:], axis=1)
         if (norm < _ZERO_QUATERNION).any():
-            raise FormatError(f"{table.places[int(norm.argmin())]}: the quaternion is zero.", path=table.path)
+            raise FormatError(f"{table.places[int(norm.argmin())]}: the quaternion is zero.")
         T = make_transform(matrix_from_wxyz(values[:, 3:]), values[:, :3])
     else:
         raise FormatError(
             f"has neither the columns {matrix[0]} ... {matrix[11]} nor {', '.join(quaternion)}; "
             f"it has {_listed(table)}.",
-            path=table.path,
             hint=None if columns else "Map other names with `jawusd fit --columns`, e.g. tx=X,ty=Y,...",
         )
     return frames, _checked_rigid(T, table)
@@ -206,12 +189,12 @@ def _checked_rigid(T: Array, table: TextTable) -> Array:
         raise FormatError(
             f"{table.places[int(defect.argmax())]}: the matrix is not rigid (deviation "
             f"{defect.max():.2g}; at most {_RIGID_TOLERANCE:g} is allowed).",
-            path=table.path,
             hint="Matrices are row-major with the translation [mm] in the last column.",
         )
     return T
 
 
+@errors_name_file
 def read_parameters(path: str | os.PathLike[str]) -> tuple[NDArray[np.int64], Array]:
     """Read frame numbers (F,) and parameters d [mm] (F, 3) from CSV or JSON.
 
@@ -225,7 +208,7 @@ def _parameters_of(table: TextTable) -> tuple[NDArray[np.int64], Array]:
     frames = _frames(table, "frame")
     missing = [name for name in PARAMETER_COLUMNS if name not in table.header]
     if missing:
-        raise FormatError(f'has no column "{missing[0]}"; it has {_listed(table)}.', path=table.path)
+        raise FormatError(f'has no column "{missing[0]}"; it has {_listed(table)}.')
     return frames, _numbers(table, PARAMETER_COLUMNS)
 
 

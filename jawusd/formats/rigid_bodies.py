@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from jawusd.base.arrays import Array
-from jawusd.base.errors import FormatError
+from jawusd.base.errors import FormatError, errors_name_file
 from jawusd.base.tables import read_text
 
 _MAX_BYTES = 1 << 24
@@ -40,6 +40,7 @@ def read_body(description: str | os.PathLike[str]) -> RigidBody:
     return _checked(_read_rig(Path(description)), text)
 
 
+@errors_name_file
 def _read_rig(path: Path) -> RigidBody:
     """Read Northern Digital's marker description: a count, then `number x y z views` for each marker."""
     lines = read_text(path, _MAX_BYTES, "latin-1").splitlines()
@@ -47,7 +48,6 @@ def _read_rig(path: Path) -> RigidBody:
     if len(counts) != 1 or not counts[0].isdigit():
         raise FormatError(
             f'is not a marker description: there is no line "{_RIG_COUNT}".',
-            path=path,
             hint="Give a .rig file, or the numbers or names of the body's markers, such as 5,6,7,8 or HL,HR,HF.",
         )
     header = next((k for k, line in enumerate(lines) if line.split()[:4] == ["Marker", "X", "Y", "Z"]), len(lines))
@@ -56,11 +56,11 @@ def _read_rig(path: Path) -> RigidBody:
         markers = tuple(int(row[0]) for row in rows)
         points = np.array([[float(value) for value in row[1:4]] for row in rows]).reshape(-1, 3)
     except (IndexError, ValueError) as error:
-        raise FormatError(f'a marker is not written as "number x y z views" ({error}).', path=path) from error
+        raise FormatError(f'a marker is not written as "number x y z views" ({error}).') from error
     if len(markers) != int(counts[0]):
-        raise FormatError(f"declares {counts[0]} markers but lists {len(markers)}.", path=path)
+        raise FormatError(f"declares {counts[0]} markers but lists {len(markers)}.")
     if not np.isfinite(points).all():
-        raise FormatError("has a position that is not a finite number.", path=path)
+        raise FormatError("has a position that is not a finite number.")
     return RigidBody(markers, points)
 
 

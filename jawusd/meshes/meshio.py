@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jawusd.base.arrays import Array
-from jawusd.base.errors import CaptureError, explain_missing_packages
+from jawusd.base.errors import CaptureError, errors_name_file, explain_missing_packages
 from jawusd.base.inputs import check_input, why_unreadable
 from jawusd.formats.file_names import MESHES
 from jawusd.formats.mesh import NO_COLOUR, Mesh, MeshData, tooth_labels, without_loose
@@ -32,6 +32,7 @@ _DIAGONAL_MM = {"scan": (20.0, 80.0, 150.0), "bone": (50.0, 200.0, 500.0)}
 _UNITS_MM = {"metres": 1000.0, "centimetres": 10.0, "inches": 25.4, "micrometres": 0.001}
 
 
+@errors_name_file
 @np.errstate(invalid="ignore", over="ignore")  # non-finite vertices are reported later, if a face uses them
 def load_mesh(path: str | os.PathLike[str], kind: Literal["scan", "bone"] = "scan") -> Mesh:
     """Read a triangle mesh [mm] from PLY, STL, OBJ or 3Shape DCM; vertices keep the order of the file.
@@ -49,20 +50,18 @@ def load_mesh(path: str | os.PathLike[str], kind: Literal["scan", "bone"] = "sca
     check_input(path, CaptureError)
     read = _READERS.get(path.suffix.lower())
     if read is None:
-        raise CaptureError(
-            f"is not a supported mesh file; expected {', '.join(MESHES)}.", path=path, hint="Convert the mesh."
-        )
+        raise CaptureError(f"is not a supported mesh file; expected {', '.join(MESHES)}.", hint="Convert the mesh.")
     try:
         if (said := why_unreadable(path)) is not None:
-            raise CaptureError(said[0], path=path, hint=said[1])
+            raise CaptureError(said[0], hint=said[1])
         data = read(path)
     except FileNotFoundError as error:
-        raise CaptureError("there is no such mesh file.", path=path, hint="Check the path in capture.toml.") from error
+        raise CaptureError("there is no such mesh file.", hint="Check the path in capture.toml.") from error
     except (OSError, ValueError, OverflowError) as error:
-        raise CaptureError(f"the mesh cannot be read ({error}).", path=path, hint="Export it again.") from error
+        raise CaptureError(f"the mesh cannot be read ({error}).", hint="Export it again.") from error
     if len(data.faces) == 0:
-        raise CaptureError("the file has no triangles.", path=path, hint=_NO_FACES)
-    return _checked(path, data, kind)
+        raise CaptureError("the file has no triangles.", hint=_NO_FACES)
+    return _checked(data, kind)
 
 
 @explain_missing_packages("dcm")
@@ -75,7 +74,7 @@ def _read_dcm(path: Path) -> MeshData:
         vertices, faces = np.array(found.vertices, np.float64), np.array(found.faces).astype(np.int64)
         texture, corners = found.texture, found.uv
     except Exception as error:  # open3sdcm raises exceptions of its own for damaged and encrypted files
-        raise CaptureError(f"the mesh cannot be read ({error}).", path=path, hint="Export it as PLY or STL.") from error
+        raise CaptureError(f"the mesh cannot be read ({error}).", hint="Export it as PLY or STL.") from error
     return MeshData(vertices, faces, _texture_colors(texture, corners, faces, len(vertices)))
 
 
@@ -100,14 +99,13 @@ def _texture_colors(
     return colors
 
 
-def _checked(path: Path, data: MeshData, kind: str) -> Mesh:
+def _checked(data: MeshData, kind: str) -> Mesh:
     faces = data.faces
     outside = np.flatnonzero(((faces < 0) | (faces >= len(data.vertices))).any(axis=1))
     if outside.size:
         raise CaptureError(
             f"triangle {outside[0]} refers to a vertex that does not exist; the mesh has "
             f"{len(data.vertices)} vertices.",
-            path=path,
             hint="Export the mesh again.",
         )
     vertices, colors = without_loose(data.vertices, faces, data.colors)
@@ -115,7 +113,6 @@ def _checked(path: Path, data: MeshData, kind: str) -> Mesh:
     if bad.size:
         raise CaptureError(
             f"vertex {bad[0]} has a coordinate that is not finite ({bad.size} such vertices).",
-            path=path,
             hint="Export the mesh again.",
         )
     low, typical, high = _DIAGONAL_MM[kind]
@@ -127,7 +124,6 @@ def _checked(path: Path, data: MeshData, kind: str) -> Mesh:
         raise CaptureError(
             f"the bounding box diagonal of the mesh is {diagonal:.4g} mm; expected {low:g} to {high:g} mm for a "
             f"{kind}.{guess}",
-            path=path,
             hint="Lengths must be in mm: scale the mesh and export it again.",
         )
     mesh = Mesh(vertices, faces.astype(np.int32), colors, uv=data.uv)

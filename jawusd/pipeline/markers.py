@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from jawusd.base.arrays import Array
-from jawusd.base.errors import FormatError, explain_missing_packages
+from jawusd.base.errors import FormatError, errors_name_file, explain_missing_packages
 from jawusd.base.inputs import check_input
 from jawusd.formats.markers import MarkerTable, length_unit, mark_hidden, read_markers
 from jawusd.formats.rigid_bodies import RigidBody, read_body
@@ -74,6 +74,7 @@ def in_head(
 
 
 @explain_missing_packages()
+@errors_name_file
 def read_c3d(path: str | os.PathLike[str]) -> MarkerTable:
     """Read the points of a C3D file; points with a negative residual are occluded (https://www.c3d.org).
 
@@ -87,7 +88,7 @@ def read_c3d(path: str | os.PathLike[str]) -> MarkerTable:
     path = Path(path)
     check_input(path)
     if not path.is_file():
-        raise FormatError("there is no such file.", path=path)
+        raise FormatError("there is no such file.")
     _check_length(path)
     try:
         file = ezc3d.c3d(str(path))
@@ -98,21 +99,19 @@ def read_c3d(path: str | os.PathLike[str]) -> MarkerTable:
         unit, rate = (given[key]["value"] for key in ("UNITS", "RATE"))
     # exceptions that ezc3d raises for invalid, corrupt or truncated files
     except (OSError, RuntimeError, LookupError, ValueError, MemoryError) as error:
-        raise FormatError(f"is not a readable C3D file ({error!s:.200}).", path=path) from error
+        raise FormatError(f"is not a readable C3D file ({error!s:.200}).") from error
     if not points.size:
-        raise FormatError("has no points or no frames.", path=path)
+        raise FormatError("has no points or no frames.")
     if len(points) >= _MOST_C3D_FRAMES:
         raise FormatError(
             f"has {_MOST_C3D_FRAMES} frames or more; C3D files cannot store that number.",
-            path=path,
             hint="Export the take as TRC or CSV, or in parts.",
         )
     points[hidden] = np.nan
     points = mark_hidden(points)
     fps = float(rate[0]) if len(rate) and rate[0] > 0 else None
-    return MarkerTable(
-        points, tuple(name.strip() for name in names[: points.shape[1]]), length_unit("".join(unit[:1]), path), fps
-    )
+    named = tuple(name.strip() for name in names[: points.shape[1]])
+    return MarkerTable(points, named, length_unit("".join(unit[:1])), fps)
 
 
 def _check_length(path: Path) -> None:

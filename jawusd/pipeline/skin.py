@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from jawusd.base.arrays import Array, Mask
-from jawusd.base.errors import FormatError
+from jawusd.base.errors import FormatError, errors_name_file
 from jawusd.base.tables import read_table
 from jawusd.evaluator import JawRig
 from jawusd.evaluator.skin import Skin, load_skin
@@ -96,6 +96,7 @@ def read_jaw(rig: JawRig, path: str | os.PathLike[str]) -> JawTake:
     return JawTake(frames.astype(np.float64), d, seen, sigma, None)
 
 
+@errors_name_file
 def _states_of(path: Path) -> tuple[Mask, Array]:
     """Return which frames in the CSV of a performance are solved (F,), and the standard deviations of d [mm] (F, 3)."""
     table = read_table(path, os.stat(path).st_size)

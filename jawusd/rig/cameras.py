@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from pxr import Gf, Kind, Sdf, Usd, UsdGeom
 
 from jawusd.base.arrays import Array
-from jawusd.base.errors import CalibrationError, RigError
+from jawusd.base.errors import CalibrationError, RigError, naming_file
 from jawusd.cameras.files import names_of_labels
 from jawusd.geometry.camera import Camera
 from jawusd.geometry.se3 import make_transform, se3_inverse
@@ -164,7 +164,8 @@ def read_cameras(path: str | os.PathLike[str], sizes: Callable[[], Mapping[str, 
     cameras = [prim for prim in stage.Traverse() if prim.IsA(UsdGeom.Camera)]
     # skips orthographic cameras, which are the top and side views of 3-D programs
     prims = [prim for prim in cameras if UsdGeom.Camera(prim).GetProjectionAttr().Get() != "orthographic"]
-    names = names_of_labels(Path(path), [str(prim.GetPath())[1:] for prim in prims])
+    with naming_file(path):
+        names = names_of_labels([str(prim.GetPath())[1:] for prim in prims])
     known: Mapping[str, tuple[int, int]] | None = None
     out = []
     for name, prim in zip(names, prims, strict=True):

@@ -308,5 +308,5 @@ def test_a_folder_without_cameras_says_what_is_read(tmp_path):
         load_cameras_file(tmp_path)
 
 
-def test_no_labels_need_no_names(tmp_path):
-    assert names_of_labels(tmp_path, []) == []
+def test_no_labels_need_no_names():
+    assert names_of_labels([]) == []
