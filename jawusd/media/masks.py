@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import os
-import queue
-import threading
+from collections import deque
 from collections.abc import Callable, Generator, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -17,9 +17,8 @@ from jawusd.formats.clips import ClipSource
 from jawusd.formats.file_names import is_pattern, numbered_files
 from jawusd.media.clip import Timeline
 from jawusd.media.footage import open_clip
-from jawusd.media.mask_files import LabelValues, OneMask, PngMasks, VideoMasks
+from jawusd.media.mask_files import LabelValues, OneMask, PngMasks, VideoMasks, load_png
 from jawusd.media.mask_levels import MaskImage, MaskLevels
-from jawusd.media.mask_source import load_png
 from jawusd.media.video import Video
 
 _LOOKED_AT = 10  # number of label images that are sampled
@@ -71,7 +70,6 @@ class MaskReader:
         self._labels = labels
         self._source: PngMasks | VideoMasks | OneMask
         self._timeline: Timeline | None
-        self.levels: MaskLevels | None = None
         if isinstance(path, OneMask):
             self._source, self._timeline = path, None
         elif is_pattern(path := Path(path)):
@@ -81,8 +79,7 @@ class MaskReader:
             self._source = pictures = VideoMasks(path, size_px, labels)
             self._timeline = _timeline_of_video(path, pictures, timeline)
         self.count = self._source.count if self._timeline is None else self._timeline.count
-        if not (labels or isinstance(self._source, OneMask)):
-            self.levels = self._source.levels.levels
+        self.levels: MaskLevels | None = None if labels else self._source.levels
         self._prepare = prepare
         self._previous: int | None = None
         self._ahead: _Ahead | None = None
@@ -270,37 +267,18 @@ class _Ahead:
 
     def __init__(self, items: Generator[MaskImage | None], first_frame: int) -> None:
         self.next_frame = first_frame
-        self._queue: queue.Queue[tuple[MaskImage | None, Exception | None]] = queue.Queue(_AHEAD)
-        self._stopping = threading.Event()
-        self._thread = threading.Thread(target=self._run, args=(items,), daemon=True, name="jawusd-masks")
-        self._thread.start()
+        self._items, self._pool = items, ThreadPoolExecutor(1, "jawusd-masks")
+        self._waiting = deque(self._pool.submit(next, items, None) for _ in range(_AHEAD))
 
     def take(self) -> MaskImage | None:
         self.next_frame += 1
-        item, error = self._queue.get()
-        if error is not None:
-            self.next_frame = -1  # the thread has ended, and no item will follow
-            raise error
-        return item
+        self._waiting.append(self._pool.submit(next, self._items, None))
+        try:
+            return self._waiting.popleft().result()
+        except Exception:
+            self.next_frame = -1  # the iterator has ended, and no item will follow
+            raise
 
     def stop(self) -> None:
-        self._stopping.set()
-        # A thread that waits for space in the queue adds at most one more item.
-        with contextlib.suppress(queue.Empty):
-            while True:
-                self._queue.get_nowait()
-        self._thread.join()
-
-    def _run(self, items: Generator[MaskImage | None]) -> None:
-        try:
-            with contextlib.closing(items):
-                for item in items:
-                    self._put(item, None)
-                    if self._stopping.is_set():
-                        return
-        except Exception as error:  # raised again by `take`, in the thread of the caller
-            self._put(None, error)
-
-    def _put(self, item: MaskImage | None, error: Exception | None) -> None:
-        if not self._stopping.is_set():
-            self._queue.put((item, error))
+        self._pool.shutdown(cancel_futures=True)
+        self._items.close()
