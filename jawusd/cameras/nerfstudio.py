@@ -12,9 +12,8 @@ import numpy as np
 
 from jawusd.base.arrays import Array
 from jawusd.base.errors import CalibrationError, FormatError
-from jawusd.base.tables import read_text
 from jawusd.cameras.files import MOST_BYTES, UNDISTORT, CameraFormat, Size, cameras_of_images, corner_matrix
-from jawusd.formats.text import parse_json
+from jawusd.formats.text import read_json
 from jawusd.geometry import Camera, rigidity_defect, se3_inverse
 
 _MOST_SCALE = 1e9
@@ -75,7 +74,7 @@ def _lens(values: dict[str, object], where: str) -> tuple[Size, Array, Array]:
 
 def _data(path: Path) -> dict[str, object]:
     try:
-        data = parse_json(read_text(path, MOST_BYTES), path)
+        data = read_json(path, MOST_BYTES)
     except FormatError as error:
         raise CalibrationError(f"cannot be read as JSON ({error.message.rstrip('.')}).") from error
     if not isinstance(data, dict):

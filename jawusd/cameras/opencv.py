@@ -19,7 +19,7 @@ from jawusd.base.arrays import Array
 from jawusd.base.errors import CalibrationError, errors_name_file, naming_file
 from jawusd.base.tables import read_text
 from jawusd.cameras.files import CameraFormat, Size, check_lens_model, files_in, known_size, parsed_xml
-from jawusd.formats.text import parse_json
+from jawusd.formats.text import read_json
 from jawusd.geometry import Camera, make_transform, rigidity_defect, so3_exp
 
 _MOST_BYTES = 16 << 20
@@ -130,9 +130,8 @@ def _values(path: Path) -> Iterator[tuple[str, tuple[int, ...], list[str]]]:
             elif not len(node):
                 yield node.tag, (), [(node.text or "").strip().strip('"')]
         return
-    text = read_text(path, _MOST_BYTES)
     if suffix == ".json":
-        stored = parse_json(text, path)
+        stored = read_json(path, _MOST_BYTES)
         for name, value in stored.items() if isinstance(stored, dict) else ():
             if isinstance(value, dict) and isinstance(value.get("data"), list):
                 rows, cols = value.get("rows"), value.get("cols")
@@ -141,6 +140,7 @@ def _values(path: Path) -> Iterator[tuple[str, tuple[int, ...], list[str]]]:
             elif not isinstance(value, dict | list):
                 yield name, (), [str(value)]
         return
+    text = read_text(path, _MOST_BYTES)
     for match in _MATRIX.finditer(text):
         yield match["name"], (int(match["rows"]), int(match["cols"])), match["data"].replace(",", " ").split()
     for match in _VALUE.finditer(text):

@@ -46,7 +46,7 @@ from jawusd.base.errors import FormatError
 from jawusd.base.npz import read_arrays, take
 from jawusd.formats.atomic import write_text_atomic
 from jawusd.formats.poses import read_poses
-from jawusd.formats.text import Strict, parse_model, read_text
+from jawusd.formats.text import Strict, read_model
 from jawusd.geometry import hat, make_transform, rigidity_defect, se3_inverse, so3_exp, transform_points
 
 _MAX_BYTES = 1 << 20
@@ -124,9 +124,8 @@ def load_correspondences(path: str | os.PathLike[str]) -> Correspondences:
     Raises:
         FormatError: the file is not one of corresponding points; the message names the wrong entry.
     """
-    path = Path(path)
     hint = "The format is described in the reference of files, and by an example in the guide to face solvers."
-    return parse_model(read_text(path, _MAX_BYTES), path, Correspondences, hint)
+    return read_model(path, _MAX_BYTES, Correspondences, hint)
 
 
 def load_alignment(path: str | os.PathLike[str]) -> Alignment:
@@ -135,8 +134,7 @@ def load_alignment(path: str | os.PathLike[str]) -> Alignment:
     Raises:
         FormatError: the file is not an alignment; the message names the wrong entry.
     """
-    path = Path(path)
-    found = parse_model(read_text(path, _MAX_BYTES), path, Alignment, "Such a file is written by `jawusd align`.")
+    found = read_model(path, _MAX_BYTES, Alignment, "Such a file is written by `jawusd align`.")
     if rigidity_defect(found.matrix) > _RIGID_TOLERANCE:
         raise FormatError('"T_skull_model" must be a rigid 4 x 4 matrix.', path=path)
     return found

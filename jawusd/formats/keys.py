@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import json
 import os
-from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import Field, model_validator
 
 from jawusd.base.arrays import Array
-from jawusd.base.tables import read_text
 from jawusd.formats.atomic import write_text_atomic
-from jawusd.formats.text import Strict, parse_model
+from jawusd.formats.text import Strict, read_model
 
 #: Maximum number of frames, all of which are baked (an hour at 60 frames per second), and maximum frame number.
 MOST_FRAMES, FARTHEST_FRAME = 220_000, 1e9
@@ -74,8 +72,7 @@ def load_keys(path: str | os.PathLike[str]) -> Keys:
     Raises:
         FormatError: the file does not contain animation keys; the message names the wrong entry.
     """
-    path = Path(path)
-    return parse_model(read_text(path, _MAX_BYTES), path, Keys)
+    return read_model(path, _MAX_BYTES, Keys)
 
 
 def save_keys(path: str | os.PathLike[str], keys: Keys) -> None:

@@ -20,7 +20,7 @@ import numpy as np
 from jawusd.base.arrays import Array
 from jawusd.base.errors import FormatError, UnitsError, errors_name_file
 from jawusd.base.npz import check_format
-from jawusd.formats.text import parse_json, read_text
+from jawusd.formats.text import read_json
 from jawusd.geometry import LANDMARKS, rigidity_defect
 
 FAMILY, VERSION = "jawusd-landmarks", 1
@@ -46,8 +46,7 @@ def load_landmarks(path: str | os.PathLike[str]) -> LandmarkFile:
         VersionError: the file was written for a newer version.
         UnitsError: lengths are not in mm.
     """
-    path = Path(path)
-    data = parse_json(read_text(path, _MAX_BYTES), path)
+    data = read_json(Path(path), _MAX_BYTES)
     if not isinstance(data, dict):
         raise FormatError("must be a JSON object.")
     check_format(data.get("format"), FAMILY, VERSION, path)

@@ -25,9 +25,9 @@ from numpy.typing import NDArray
 
 from jawusd.base.arrays import Array
 from jawusd.base.errors import FormatError, errors_name_file
-from jawusd.base.tables import TextTable, is_number, read_table, read_text
+from jawusd.base.tables import TextTable, is_number, read_table
 from jawusd.formats.atomic import write_text_atomic
-from jawusd.formats.text import parse_json
+from jawusd.formats.text import read_json
 from jawusd.geometry import make_transform, matrix_from_wxyz, rigidity_defect
 from jawusd.geometry.so3 import wxyz_from_matrix
 
@@ -74,7 +74,7 @@ def _header_hint(table: TextTable) -> str:
 
 
 def _json_table(path: Path) -> TextTable:
-    records = parse_json(read_text(path, _MAX_BYTES), path)
+    records = read_json(path, _MAX_BYTES)
     if not isinstance(records, list) or not all(isinstance(record, dict) for record in records):
         what = 'a list with an object for each frame, such as [{"frame": 1, "d1": 20, "d2": 2, "d3": 1}]'
         raise FormatError(f"must be {what}, or keys: {KEYS_EXAMPLE}.")

@@ -11,7 +11,7 @@ from typing import Annotated, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
-from jawusd.base.errors import FormatError
+from jawusd.base.errors import FormatError, errors_name_file
 from jawusd.base.tables import read_text
 from jawusd.formats.capture_keys import table_model
 
@@ -64,14 +64,16 @@ def _not_toml(text: str, said: str) -> tuple[str, str]:
     return said, 'Write text in quotes, such as name = "anna", and tables in brackets, such as [scans].'
 
 
-def parse_json(text: str, path: Path) -> object:
-    """Parse a JSON text read from a file.
+@errors_name_file
+def read_json(path: Path, most_bytes: int) -> object:
+    """Return the content of a JSON file of at most `most_bytes`.
 
     Raises:
-        FormatError: the text is not JSON.
+        FormatError: the file is missing, too large, not text or not JSON.
     """
+    text = read_text(path, most_bytes)
     if not text.strip():
-        raise FormatError("is empty.", path=path)
+        raise FormatError("is empty.")
     try:
         return json.loads(text)
     except json.JSONDecodeError as error:
@@ -83,20 +85,19 @@ def parse_json(text: str, path: Path) -> object:
         elif before == ",":
             hint = "Remove the comma before it, or add the missing entry."
         said = f"line {error.lineno}, {line[:_SHOWN]}: {error.msg}" if line else f"line {error.lineno}: {error.msg}"
-        raise FormatError(f"is not JSON: {said}.", path=path, hint=hint) from error
+        raise FormatError(f"is not JSON: {said}.", hint=hint) from error
     except (ValueError, RecursionError) as error:  # raised for numbers of more than 4300 digits, and for deep nesting
-        raise FormatError(f"is not JSON ({error}).", path=path) from error
+        raise FormatError(f"is not JSON ({error}).") from error
 
 
-def parse_model(text: str, path: Path, model: type[Model], hint: str | None = None) -> Model:
-    """Parse a JSON text read from a file into a pydantic model; field descriptions are used in messages.
+def read_model(path: str | os.PathLike[str], most_bytes: int, model: type[Model], hint: str | None = None) -> Model:
+    """Read a JSON file of at most `most_bytes` as a pydantic model, whose field descriptions are used in messages.
 
     Raises:
-        FormatError: the text is not JSON, or a value is missing or wrong.
+        FormatError: the file is not JSON, or a value is missing or wrong.
     """
-    data = parse_json(text, path)
     try:
-        return model.model_validate(data)
+        return model.model_validate(read_json(Path(path), most_bytes))
     except ValidationError as error:
         raise FormatError(f"{_fault(error, model)}.", path=path, hint=hint) from error
 

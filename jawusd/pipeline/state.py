@@ -29,7 +29,7 @@ from jawusd.base.version import __version__
 from jawusd.formats.atomic import ELSEWHERE, clear_unfinished, destination, write_text_atomic
 from jawusd.formats.finding import Finding
 from jawusd.formats.report import BuildVerdict, Origin, verdict_sentence
-from jawusd.formats.text import of_kind, parse_json, read_text
+from jawusd.formats.text import of_kind, read_json
 
 FAMILY, VERSION = "jawusd-build", 1
 BUILD_FILE = "build.json"
@@ -150,7 +150,7 @@ class BuildState:
 
 def _read(path: Path) -> dict[str, StageRecord[Mapping[str, object]]]:
     try:
-        data = parse_json(read_text(path, _MOST_BYTES), path)
+        data = read_json(path, _MOST_BYTES)
         if not isinstance(data, dict):
             raise ValueError("it is not a JSON object")
         check_format(data.get("format"), FAMILY, VERSION, path)

@@ -8,7 +8,7 @@ from jawusd.base.errors import FormatError
 from jawusd.formats.keys import load_keys
 from jawusd.formats.landmarks import load_landmarks
 from jawusd.formats.poses import read_parameters
-from jawusd.formats.text import parse_json, read_toml
+from jawusd.formats.text import read_json, read_toml
 from jawusd.geometry import LANDMARKS
 
 
@@ -73,5 +73,7 @@ def test_json_and_toml_of_every_encoding_are_read(tmp_path, name, encoding, end)
     ],
 )
 def test_what_is_not_json_is_named_with_its_line(tmp_path, text, words):
+    path = tmp_path / "a.json"
+    path.write_text(text, encoding="utf-8")
     with pytest.raises(FormatError, match=words):
-        parse_json(text, tmp_path / "a.json")
+        read_json(path, 1 << 20)
