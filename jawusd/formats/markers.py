@@ -1,4 +1,4 @@
-"""Read tables of marker positions from optical tracking systems.
+"""Read tables of marker positions from optical tracking systems, and rigid bodies of markers.
 
 Supported tables have one row per frame with x, y, z of every marker, in any locale (see `jawusd.base.tables`); frames
 are numbered from 0:
@@ -12,6 +12,9 @@ are numbered from 0:
 
 A marker is hidden where a coordinate is blank, nan or huge (-3.697314e28), or all three are exactly 0 (except in
 probes, which are simulated). Frames that a numbered table omits have no markers.
+
+A rigid body is given by a marker description of Northern Digital (`.rig`), or by numbers or names of markers in the
+table.
 """
 
 from __future__ import annotations
@@ -48,6 +51,8 @@ _LENGTHS = ("mm", "cm", "m")
 _MAX_BYTES = 1 << 28
 _MOST_FRAMES = 10_000_000
 _OUT_OF_SIGHT = 1e20  # minimum magnitude of a coordinate for a marker to count as hidden
+_MAX_RIG_BYTES = 1 << 24
+_RIG_COUNT = "number of markers"  # text in the line of a marker description that states their number
 _INTERPOLATIONS = ("step", "linear", "parabolic", "cubic", "cubicstep", "quadraticstep", "sphericallinear")
 _LEADING_ZERO = re.compile(r"[+-]?0\d+")
 
@@ -167,24 +172,19 @@ def _positions(rows: _Rows, first: int, width: int, zeros: bool = True) -> Array
 
 def _read_qtm(rows: _Rows) -> MarkerTable:
     """Read 3D data in TSV of Qualisys Track Manager."""
-    keys = {row[0].strip().upper(): [cell.strip() for cell in row[1:] if cell.strip()] for _, row in rows[:40]}
-    included = "".join(keys.get("DATA_INCLUDED", ["3D"])[:1])
-    if included != "3D" or "MARKER_NAMES" not in keys:
+    keys = {row[0].strip().lower(): [cell.strip() for cell in row[1:] if cell.strip()] for _, row in rows[:40]}
+    included = "".join(keys.get("data_included", ["3D"])[:1])
+    if included != "3D" or "marker_names" not in keys:
         raise FormatError(f"contains {included} data from Qualisys Track Manager, not markers.", hint=READ)
-    names = tuple(keys["MARKER_NAMES"])
-    count = _whole(keys.get("NO_OF_MARKERS"), len(names), "NO_OF_MARKERS")
-    if count != len(names):
-        raise FormatError(f"declares {count} markers but names {len(names)}.")
-    data = [(line, row) for line, row in rows if _is_number_or_blank(row[0])]
+    names = tuple(keys["marker_names"])
+    data = [(line, row) for line, row in rows if not re.match(r"(?!nan$)[^\W\d]", row[0].strip(), re.IGNORECASE)]
     header = next((row for _, row in rows if row[0].strip().lower() == "frame"), [])
     first = [cell.strip().lower() in ("frame", "time") for cell in header[:2]].count(True)
     if not header:  # skip extra columns at the beginning, which are frame and time
         filled = max((k + 1 for _, row in data for k, cell in enumerate(row) if cell.strip()), default=0)
-        first = max(filled - 3 * count, 0)
-    points = _positions(data, first, 3 * count)
-    _check_count(_whole(keys.get("NO_OF_FRAMES"), len(data), "NO_OF_FRAMES"), len(data))
-    fps = _rate(keys.get("FREQUENCY"), "FREQUENCY")
-    return MarkerTable(points, names, "mm", fps)
+        first = max(filled - 3 * len(names), 0)
+    points = _declared(data, first, names, keys, "NO_OF_MARKERS", "NO_OF_FRAMES")
+    return MarkerTable(points, names, "mm", _rate(keys.get("frequency"), "FREQUENCY"))
 
 
 def _read_trc(rows: _Rows, at: int) -> MarkerTable:
@@ -194,14 +194,27 @@ def _read_trc(rows: _Rows, at: int) -> MarkerTable:
         if above[0].strip().lower() == "datarate":
             keys = {key.strip().lower(): [value.strip()] for key, value in zip(above, below)}
     names = tuple(cell.strip() for cell in rows[at][1][2:] if cell.strip())
-    count = _whole(keys.get("nummarkers"), len(names), "NumMarkers")
+    data = [(line, row) for line, row in rows[at + 1 :] if row[0].strip() and row[0].strip().lower() != "x1"]
+    points = _declared(data, 2, names, keys, "NumMarkers", "NumFrames")
+    unit = length_unit("".join(keys.get("units", [])))
+    return MarkerTable(_with_gaps(data, points), names, unit, _rate(keys.get("datarate")))
+
+
+def _declared(
+    data: _Rows, first: int, names: tuple[str, ...], keys: dict[str, list[str]], markers: str, frames: str
+) -> Array:
+    """Return positions (F, N, 3) after checking the numbers that a header has under the keys `markers`, `frames`."""
+    count = _whole(keys.get(markers.lower()), len(names), markers)
     if count != len(names):
         raise FormatError(f"declares {count} markers but names {len(names)}.")
-    data = [(line, row) for line, row in rows[at + 1 :] if row[0].strip() and row[0].strip().lower() != "x1"]
-    points = _positions(data, 2, 3 * count)
-    _check_count(_whole(keys.get("numframes"), len(data), "NumFrames"), len(data))
-    unit = "".join(keys.get("units", []))
-    return MarkerTable(_with_gaps(data, points), names, length_unit(unit), _rate(keys.get("datarate"), ""))
+    points = _positions(data, first, 3 * count)
+    said = _whole(keys.get(frames.lower()), len(data), frames)
+    if said != len(data):
+        raise FormatError(
+            f"is truncated or was edited: its header declares {said} frames, but it has {len(data)}.",
+            hint="Export it again, or correct the number in its header.",
+        )
+    return points
 
 
 def _read_vicon(rows: _Rows) -> MarkerTable:
@@ -224,7 +237,7 @@ def _read_vicon(rows: _Rows) -> MarkerTable:
         raise FormatError(f"its markers have the units {', '.join(sorted(found))}; expected one unit.")
     points = np.concatenate([_positions([(line, row[k : k + 3]) for line, row in data], 0, 3) for k in places], axis=1)
     names = tuple(named[k] for k in places)
-    return MarkerTable(_with_gaps(data, points), names, length_unit(found.pop()), _rate(rows[1][1], ""))
+    return MarkerTable(_with_gaps(data, points), names, length_unit(found.pop()), _rate(rows[1][1]))
 
 
 def _with_gaps(data: _Rows, points: Array) -> Array:
@@ -242,18 +255,6 @@ def _with_gaps(data: _Rows, points: Array) -> Array:
     return whole
 
 
-def _is_number_or_blank(cell: str) -> bool:
-    return not cell.strip() or cell.strip().lower() == "nan" or not re.match(r"[^\W\d]", cell.strip())
-
-
-def _check_count(said: int, found: int) -> None:
-    if found != said:
-        raise FormatError(
-            f"is truncated or was edited: its header declares {said} frames, but it has {found}.",
-            hint="Export it again, or correct the number in its header.",
-        )
-
-
 def _whole(cells: list[str] | None, default: int, key: str) -> int:
     if not cells:
         return default
@@ -263,12 +264,12 @@ def _whole(cells: list[str] | None, default: int, key: str) -> int:
     return int(value)
 
 
-def _rate(cells: list[str] | None, key: str) -> float | None:
+def _rate(cells: list[str] | None, key: str = "the rate") -> float | None:
     if not cells:
         return None
-    value = float(to_numbers([cells[:1]], lambda *_: key or "the rate")[0, 0])
+    value = float(to_numbers([cells[:1]], lambda *_: key)[0, 0])
     if not 0 < value < np.inf:
-        raise FormatError(f"{key or 'the rate'} is {cells[0]}; it must be greater than 0 per second.")
+        raise FormatError(f"{key} is {cells[0]}; it must be greater than 0 per second.")
     return value
 
 
@@ -292,3 +293,57 @@ def _probe_size(row: list[str]) -> int:
         raise FormatError(
             'line 2 must be like "Linear 9 0.02" in an ArtiSynth probe (interpolation, numbers per frame, step).'
         ) from error
+
+
+@dataclass(frozen=True)
+class RigidBody:
+    """Rigid body: its markers and, if known, their positions on the body."""
+
+    markers: tuple[int | str, ...]  # numbers of the markers in the table, counted from 1, or names
+    #: positions in the body's coordinate frame, in the unit of the file, shape (N, 3); None if unknown
+    points: Array | None
+
+
+@errors_name_file
+def read_body(description: str | os.PathLike[str]) -> RigidBody:
+    """Read a rigid body: a marker description file (.rig), or the numbers or names of its markers (`5,6,7,8`).
+
+    Raises:
+        FormatError: the text is neither a file nor a list, or the body has fewer than three distinct markers.
+    """
+    pieces = [piece.strip() for piece in os.fspath(description).split(",")]
+    if all(piece.isascii() and piece.isdigit() for piece in pieces):
+        body = RigidBody(tuple(map(int, pieces)), None)
+    elif len(pieces) > 1 and not Path(description).is_file():
+        body = RigidBody(tuple(pieces), None)
+    else:
+        body = _read_rig(Path(description))
+    listed = ", ".join(map(str, body.markers))
+    if len(set(body.markers)) != len(body.markers) or 0 in body.markers or "" in body.markers:
+        raise FormatError(f"markers {listed}: each must be listed once, numbered from 1.")
+    if len(body.markers) < 3:
+        raise FormatError(f"lists the markers {listed or 'none'}; at least three are needed.")
+    return body
+
+
+def _read_rig(path: Path) -> RigidBody:
+    """Read Northern Digital's marker description: a count, then `number x y z views` for each marker."""
+    lines = read_text(path, _MAX_RIG_BYTES, "latin-1").splitlines()
+    counts = [line.partition(";")[0].strip() for line in lines if _RIG_COUNT in line.lower()]
+    if len(counts) != 1 or not counts[0].isdigit():
+        raise FormatError(
+            f'is not a marker description: there is no line "{_RIG_COUNT}".',
+            hint="Give a .rig file, or the numbers or names of the body's markers, such as 5,6,7,8 or HL,HR,HF.",
+        )
+    header = next((k for k, line in enumerate(lines) if line.split()[:4] == ["Marker", "X", "Y", "Z"]), len(lines))
+    rows = [line.split() for line in lines[header + 1 :] if line.strip()]
+    try:
+        markers = tuple(int(row[0]) for row in rows)
+        points = np.array([[float(value) for value in row[1:4]] for row in rows]).reshape(-1, 3)
+    except (IndexError, ValueError) as error:
+        raise FormatError(f'a marker is not written as "number x y z views" ({error}).') from error
+    if len(markers) != int(counts[0]):
+        raise FormatError(f"declares {counts[0]} markers but lists {len(markers)}.")
+    if not np.isfinite(points).all():
+        raise FormatError("has a position that is not a finite number.")
+    return RigidBody(markers, points)

@@ -12,8 +12,7 @@ import numpy as np
 from jawusd.base.arrays import Array
 from jawusd.base.errors import FormatError, errors_name_file, explain_missing_packages
 from jawusd.base.inputs import check_input
-from jawusd.formats.markers import MarkerTable, length_unit, mark_hidden, read_markers
-from jawusd.formats.rigid_bodies import RigidBody, read_body
+from jawusd.formats.markers import MarkerTable, RigidBody, length_unit, mark_hidden, read_body, read_markers
 from jawusd.geometry import rigid_fits, se3_inverse, transform_points
 
 BODIES = ("head", "jaw")
@@ -37,7 +36,7 @@ def marker_poses(
 
     Args:
         path: the table (see `formats.markers.read_markers`) or a C3D file.
-        rigid: descriptions of the rigid bodies "head" and "jaw" (see `formats.rigid_bodies.read_body`); without "head",
+        rigid: descriptions of the rigid bodies "head" and "jaw" (see `formats.markers.read_body`); without "head",
             the table is in head coordinates.
         rest_frame: frame that defines the marker positions of rigid bodies for which only marker names are given.
         unit: unit of the rigid bodies, and of tables that do not state a unit; a key of `LENGTH_UNITS_MM`.

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from jawusd.base.errors import FormatError
-from jawusd.formats.markers import read_markers
-from jawusd.formats.rigid_bodies import read_body
+from jawusd.formats.markers import read_body, read_markers
 
 # as opto2ascii writes: a marker out of sight is a huge number
 NDI = """1.000000e+02 2.000000e+02 -2.500000e+03 1.500000e+02 2.000000e+02 -2.500000e+03

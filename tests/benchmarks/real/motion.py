@@ -13,8 +13,7 @@ from sources import CHEWING, OPTOTRAK
 
 from jawusd.fitting.checks import missing_movements, shown_parameters
 from jawusd.fitting.data import SubjectAnatomy, TrainingData, select_poses
-from jawusd.formats.markers import read_markers
-from jawusd.formats.rigid_bodies import read_body
+from jawusd.formats.markers import read_body, read_markers
 from jawusd.geometry import (
     make_transform,
     rigid_fits,
