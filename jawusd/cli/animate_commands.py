@@ -24,7 +24,7 @@ from jawusd.cli.motion import (
 from jawusd.cli.output import emit, refuse_any
 from jawusd.cli.stage_commands import holds_stage, moved_mm, read_stage_motion, still_lines
 from jawusd.evaluator import JawRig
-from jawusd.formats.arkit import read_arkit, shares_of
+from jawusd.formats.arkit import read_arkit, read_blend_shapes, shares_of
 from jawusd.formats.atomic import refuse_existing
 from jawusd.formats.poses import save_joint_table
 
@@ -197,14 +197,14 @@ def read_face(rig: JawRig, source: Path, fps: float | None, mapping: Path | None
     Raises:
         FormatError: the file is invalid or has no row with a face, or the mapping belongs to another subject.
     """
-    from jawusd.pipeline.skin import load_own_skin, own_columns, read_blend_face
+    from jawusd.pipeline.skin import load_own_skin, own_columns
 
     if mapping is not None:
-        face, skin = read_blend_face(source, fps), load_own_skin(rig, mapping)
+        face, skin = read_blend_shapes(source, fps), load_own_skin(rig, mapping)
         frames, rate, d = face.frames, face.fps, skin(own_columns(skin, mapping, face, source)).d
     else:
-        capture = read_arkit(source, fps)
-        frames, rate, d = capture.frames, capture.fps, rig.denormalized(shares_of(capture.weights))
+        face = read_arkit(source, fps)
+        frames, rate, d = face.frames, face.fps, rig.denormalized(shares_of(face.X))
     if not np.isfinite(d).any():
         raise FormatError("no row has a face (BlendShapeCount is 0 in all rows).", path=source)
     return AuthoredMotion(frames, d, rate)

@@ -128,10 +128,10 @@ def arkit_fit(
 
     Face and jaw must be captured together. The subject must open the jaw wide, and move it to both sides and forward.
     """
-    from jawusd.pipeline.skin import read_jaw_weights
+    from jawusd.formats.arkit import read_arkit
 
     refuse_existing(out, force)
-    _learn(rig, take, read_jaw_weights(face, fps), out, jaw_fps, offset, prim, as_json, weights=True)
+    _learn(rig, take, read_arkit(face, fps), out, jaw_fps, offset, prim, as_json, weights=True)
 
 
 def _learn(

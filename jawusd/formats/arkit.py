@@ -10,7 +10,7 @@ that record 60 samples per second with a 30 fps time code write a fraction of `.
 and 59.94 frames per second, time codes may skip the first two or four frame numbers of every minute that is not a
 multiple of ten ("drop frame", SMPTE ST 12-1), marked by a semicolon before the frames or by the skipped numbers
 themselves. Column names are case-insensitive; other columns are ignored. In a row whose BlendShapeCount is 0, no face
-was detected.
+was detected. Frame numbers of the result are 0 in the first row, and may be fractional; weights are nominally 0 to 1.
 """
 
 from __future__ import annotations
@@ -18,7 +18,6 @@ from __future__ import annotations
 import math
 import os
 import re
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -27,6 +26,7 @@ from numpy.typing import NDArray
 from jawusd.base.arrays import Array
 from jawusd.base.errors import FormatError, errors_name_file
 from jawusd.base.tables import TextTable, check_width, read_table
+from jawusd.formats.face_table import FaceTable
 
 _OTHER = re.compile(r"(head|lefteye|righteye)(yaw|pitch|roll)")  # columns of rotations, which are not blend shapes
 JAW_COLUMNS = ("jawopen", "jawleft", "jawright", "jawforward")
@@ -44,36 +44,15 @@ _LEAST_WEIGHT, _MOST_WEIGHT, _PERCENT = -0.5, 2.0, 10.0
 _MAX_BYTES = 1 << 30
 
 
-@dataclass(frozen=True, eq=False)
-class BlendShapes:
-    """Weights of all blend shapes of a face capture."""
-
-    frames: Array  # increasing frame numbers, 0 in the first row, possibly fractional, shape (F,)
-    weights: Array  # one column per blend shape, nominally 0 to 1, NaN if no face was detected, shape (F, K)
-    names: tuple[str, ...]  # names of the blend shapes, length K
-    fps: float  # frame rate [Hz]
-
-
-@dataclass(frozen=True, eq=False)
-class FaceCapture:
-    """The jaw weights of a face capture."""
-
-    frames: Array  # increasing frame numbers, 0 in the first row, possibly fractional, shape (F,)
-    # JawOpen, JawLeft (subject's left), JawRight, JawForward: nominally 0 to 1, NaN if no face was seen, shape (F, 4)
-    weights: Array
-    fps: float  # frame rate [Hz]
-    timecode: str  # time code of the first row, as written
-
-
 def shares_of(weights: Array) -> Array:
-    """Convert weights (F, 4) to opening, leftward and forward motion as fractions of the full ranges, shape (F, 3)."""
+    """Convert weights (F, 4) of `JAW_COLUMNS` to opening, left and forward motion as shares of the ranges, (F, 3)."""
     opening, left, right, forward = weights.T
     return np.stack([opening, left - right, forward], axis=1)
 
 
 @errors_name_file
-def read_arkit(path: str | os.PathLike[str], fps: float | None = None) -> FaceCapture:
-    """Read a face capture (CSV) of Live Link Face.
+def read_arkit(path: str | os.PathLike[str], fps: float | None = None) -> FaceTable:
+    """Read the weights of `JAW_COLUMNS` from a face capture (CSV) of Live Link Face; left is the subject's left.
 
     Args:
         fps: frame rate of the result [Hz]: the sample rate, the time code rate, or an integer multiple or fraction of
@@ -83,14 +62,12 @@ def read_arkit(path: str | os.PathLike[str], fps: float | None = None) -> FaceCa
         FormatError: the file is not such a table, a value is not finite, a time code does not increase, or the rate
             does not fit the time codes. The message names line and column.
     """
-    path = Path(path)
-    table, columns = _read_columns(path, (_TIME, *JAW_COLUMNS))
-    frames, rate, first = _timed(table, columns.index(_TIME), fps)
-    return FaceCapture(frames, _weights(table, columns, [columns.index(name) for name in JAW_COLUMNS]), rate, first)
+    table, columns = _read_columns(Path(path), (_TIME, *JAW_COLUMNS))
+    return _captured(table, columns, [columns.index(name) for name in JAW_COLUMNS], JAW_COLUMNS, fps)
 
 
 @errors_name_file
-def read_blend_shapes(path: str | os.PathLike[str], fps: float | None = None) -> BlendShapes:
+def read_blend_shapes(path: str | os.PathLike[str], fps: float | None = None) -> FaceTable:
     """Read all blend shapes of a face capture of Live Link Face (see `read_arkit`); rotations are left out.
 
     Raises:
@@ -100,8 +77,14 @@ def read_blend_shapes(path: str | os.PathLike[str], fps: float | None = None) ->
     shapes = [k for k, name in enumerate(columns) if name not in (_TIME, _COUNT) and not _OTHER.fullmatch(name)]
     if not shapes:
         raise FormatError("has no columns of blend shapes.")
-    frames, rate, _ = _timed(table, columns.index(_TIME), fps)
-    return BlendShapes(frames, _weights(table, columns, shapes), tuple(table.header[k] for k in shapes), rate)
+    return _captured(table, columns, shapes, tuple(table.header[k] for k in shapes), fps)
+
+
+def _captured(
+    table: TextTable, columns: list[str], shapes: list[int], names: tuple[str, ...], fps: float | None
+) -> FaceTable:
+    frames, rate, first = _timed(table, columns.index(_TIME), fps)
+    return FaceTable(frames, _weights(table, columns, shapes), names, rate, timecode=first)
 
 
 def _read_columns(path: Path, needed: tuple[str, ...]) -> tuple[TextTable, list[str]]:

@@ -33,6 +33,7 @@ class FaceTable:
     names: tuple[str, ...]  # names of the columns or points; may be empty
     fps: float | None  # frame rate [Hz]; 1 if `frames` are times [s], None if unknown
     unit: str | None = None  # length unit of points, None if unknown
+    timecode: str = ""  # time code of the first row, as written; "" if there is none
 
 
 @errors_name_file

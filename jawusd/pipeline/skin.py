@@ -16,7 +16,7 @@ from jawusd.evaluator import JawRig
 from jawusd.evaluator.skin import Skin, load_skin
 from jawusd.fitting.face import check_jaw_weights, columns_at
 from jawusd.fitting.skin import HEAD_ERROR, clock_offset, fit_skin
-from jawusd.formats.arkit import JAW_COLUMNS, read_arkit, read_blend_shapes
+from jawusd.formats.arkit import read_blend_shapes
 from jawusd.formats.face_table import FaceTable, header_of, is_face_table, read_face_table
 from jawusd.formats.markers import read_markers
 from jawusd.formats.performance import SolveState
@@ -174,7 +174,7 @@ def read_face(
     Args:
         path: see `formats.markers`, `formats.arkit` and `formats.face_table`.
         fps, unit: frame rate [1/s] and unit of the points, if the file does not state them.
-        rigid: the rigid body "head", formed by markers on the head (see `formats.rigid_bodies`); points are then
+        rigid: the rigid body "head", formed by markers on the head (see `formats.markers`); points are then
             returned relative to it. Default: the head does not move, or the points are stabilised.
         rest_frame: frame that defines the marker positions on the head, if only the names of its markers are given.
 
@@ -185,7 +185,7 @@ def read_face(
     marked = path.suffix.lower() in (".c3d", ".trc") or not path.is_file()
     header = [] if marked else header_of(path)
     if "timecode" in header:
-        face = read_blend_face(path, fps)
+        face = read_blend_shapes(path, fps)
     elif is_face_table(header):
         face = read_face_table(path)
         face = replace(face, fps=face.fps or fps)
@@ -214,18 +214,6 @@ def read_shot_face(skin: Skin, options: SkinOptions) -> tuple[Array, Array]:
     if not face.fps:
         raise FormatError("does not state its frame rate.", path=options.face, hint="Give it with --face-fps.")
     return face.frames / face.fps, columns.reshape(len(columns), -1)
-
-
-def read_blend_face(path: str | os.PathLike[str], fps: float | None = None) -> FaceTable:
-    """Read all blend shapes of a CSV of Live Link Face; see `formats.arkit.read_blend_shapes`."""
-    shapes = read_blend_shapes(path, fps)
-    return FaceTable(shapes.frames, shapes.weights, shapes.names, shapes.fps)
-
-
-def read_jaw_weights(path: str | os.PathLike[str], fps: float | None = None) -> FaceTable:
-    """Read the four jaw weights of a CSV of Live Link Face; see `formats.arkit.read_arkit`."""
-    face = read_arkit(path, fps)
-    return FaceTable(face.frames, face.weights, JAW_COLUMNS, face.fps)
 
 
 def learn_skin(

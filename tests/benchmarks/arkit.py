@@ -23,8 +23,7 @@ import numpy as np  # noqa: E402
 sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
 from face_takes import JAW_FPS, Performer  # noqa: E402
 
-from jawusd.formats.arkit import JAW_COLUMNS, shares_of  # noqa: E402
-from jawusd.formats.face_table import FaceTable  # noqa: E402
+from jawusd.formats.arkit import shares_of  # noqa: E402
 from jawusd.pipeline.skin import SIGMA_MM, JawTake, learn_skin  # noqa: E402
 
 APART_S = 1.7
@@ -42,12 +41,11 @@ def main() -> None:
         d = performer.rig.encode(measured).d
         frames, seen = np.arange(len(d)) + APART_S * JAW_FPS, np.isfinite(d).all(axis=1)
         take = JawTake(frames, d, seen, np.full(d.shape, SIGMA_MM), JAW_FPS)
-        weights = FaceTable(face.frames, face.weights, JAW_COLUMNS, face.fps)
-        skin, offset_s = learn_skin(performer.rig, take, weights)
+        skin, offset_s = learn_skin(performer.rig, take, face)
         other, truth, _ = performer.perform("hidden", 2000, 2)
         times = other.frames / other.fps
-        shares = performer.incisal_error(performer.rig.denormalized(shares_of(other.weights)), times, truth)
-        learned = performer.incisal_error(skin(other.weights).d, times, truth)
+        shares = performer.incisal_error(performer.rig.denormalized(shares_of(other.X)), times, truth)
+        learned = performer.incisal_error(skin(other.X).d, times, truth)
         ratios.append(learned / shares)
         apart = f"{skin.errors_mm['skin']:8.2f}  {1000 * (offset_s - APART_S):8.1f}"
         print(f"{seed:6d}  {shares:6.2f}  {learned:7.2f}  {ratios[-1]:5.2f}  {apart}")

@@ -22,7 +22,7 @@ def take():
 def test_what_is_learned_poses_the_mandible_better_than_fixed_shares(take):
     """Tested on other exercises, with clocks 1.7 s apart, and frames without a face or a jaw."""
     performer, face, times, d = take
-    weights, seen = face.weights.copy(), np.ones(len(d), bool)
+    weights, seen = face.X.copy(), np.ones(len(d), bool)
     weights[300:330] = np.nan
     seen[500:520] = False
     face_s = face.frames / face.fps
@@ -31,8 +31,8 @@ def test_what_is_learned_poses_the_mandible_better_than_fixed_shares(take):
     skin = fit_skin(performer.rig, columns_at(face_s + offset_s, weights, times + 1.7), d, seen)
     other, truth, _ = performer.perform("hidden", 2000, 2)
     at = other.frames / other.fps
-    shares = performer.incisal_error(performer.rig.denormalized(shares_of(other.weights)), at, truth)
-    own = performer.incisal_error(skin(other.weights).d, at, truth)
+    shares = performer.incisal_error(performer.rig.denormalized(shares_of(other.X)), at, truth)
+    own = performer.incisal_error(skin(other.X).d, at, truth)
     assert own <= 0.6 * shares
     assert 0.7 < skin.errors_mm["skin"] / own < 1.3
 
@@ -41,7 +41,7 @@ def test_offsets_are_refined_below_their_step(take):
     """The best of the coarse offsets is 0.04 s off."""
     _, face, times, d = take
     face_s = face.frames / face.fps
-    assert abs(refined_offset(0.04, face_s, face.weights, times, d)) < 0.012
+    assert abs(refined_offset(0.04, face_s, face.X, times, d)) < 0.012
 
 
 def test_clocks_of_short_and_unrelated_takes_are_refused(take):
@@ -51,7 +51,7 @@ def test_clocks_of_short_and_unrelated_takes_are_refused(take):
         offsets_between(face_s, times[:200])
     mixed = d[np.random.default_rng(0).permutation(len(d))]
     with pytest.raises(FittingError, match="do not follow the jaw at any clock offset"):
-        clock_offset(face_s, face.weights, times, mixed)
+        clock_offset(face_s, face.X, times, mixed)
 
 
 @pytest.mark.parametrize(
@@ -64,7 +64,7 @@ def test_clocks_of_short_and_unrelated_takes_are_refused(take):
 )
 def test_takes_without_a_direction_are_refused(take, change, said):
     performer, face, times, d = take
-    weights = columns_at(face.frames / face.fps, face.weights, times)
+    weights = columns_at(face.frames / face.fps, face.X, times)
     check_jaw_weights(performer.rig, weights, d, 0.5)
     with pytest.raises(FittingError, match=said):
         check_jaw_weights(performer.rig, weights, change(d), 0.5)
@@ -72,7 +72,7 @@ def test_takes_without_a_direction_are_refused(take, change, said):
 
 def test_a_constant_weight_is_refused(take):
     performer, face, times, d = take
-    weights = columns_at(face.frames / face.fps, face.weights, times)
+    weights = columns_at(face.frames / face.fps, face.X, times)
     weights[:, 3] = 0.02
     with pytest.raises(FittingError, match="movement forward never changes"):
         check_jaw_weights(performer.rig, weights, d, 0.5)

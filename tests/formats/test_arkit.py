@@ -28,8 +28,8 @@ def test_frames_weights_and_rate_come_from_the_file(tmp_path, rate):
     found = read_arkit(take(tmp_path / "face.csv", frames, rate))
     assert found.fps == rate and found.timecode == timecode(int(frames[0]), rate)
     np.testing.assert_allclose(found.frames, frames - frames[0], atol=1e-6)
-    np.testing.assert_allclose(found.weights[:, 0], frames / 1000)
-    np.testing.assert_allclose(found.weights[0, 1:], [0.3, 0.2, 0.1])
+    np.testing.assert_allclose(found.X[:, 0], frames / 1000)
+    np.testing.assert_allclose(found.X[0, 1:], [0.3, 0.2, 0.1])
 
 
 def test_column_names_count_without_case_and_a_byte_order_mark_is_skipped(tmp_path):
@@ -51,7 +51,7 @@ def test_rows_without_a_face_are_lost_not_closed(tmp_path):
     lines[5] = f"{timecode(4, 30)},0"
     lines[6] = f"{timecode(5, 30)},0,,,,,,"
     path.write_text("\n".join(lines))
-    weights = read_arkit(path).weights
+    weights = read_arkit(path).X
     assert np.isnan(weights[4:6]).all() and np.isfinite(np.delete(weights, [4, 5], axis=0)).all()
 
 
@@ -114,8 +114,8 @@ def test_weights_on_another_scale_are_refused(tmp_path, change, words):
         path.write_text("\n".join([HEADER, *rows]))
         return path
 
-    assert read_arkit(written(weights)).weights.max() == 0.9
-    assert read_arkit(written(1.3 * weights - 0.1)).weights.max() > 1  # gains and a personal neutral face
+    assert read_arkit(written(weights)).X.max() == 0.9
+    assert read_arkit(written(1.3 * weights - 0.1)).X.max() > 1  # gains and a personal neutral face
     with pytest.raises(FormatError) as error:
         read_arkit(written(change(weights)))
     assert all(word in str(error.value) for word in words)

@@ -58,7 +58,7 @@ READERS = {
     ),
     "ARKit": (
         rows_of("Timecode BlendShapeCount JawOpen JawLeft JawRight JawForward", WEIGHTS, CODES),
-        lambda path: np.column_stack([read_arkit(path).frames, read_arkit(path).weights]),
+        lambda path: np.column_stack([read_arkit(path).frames, read_arkit(path).X]),
     ),
     "RealityScan": (rows_of("#name x y alt heading pitch roll f", VIEWS, [["a.jpg"], ["b.jpg"]]), cameras),
     "the evaluator's command": (rows_of(" ".join(CELLS), MATRICES), table_of_evaluator),

@@ -4,7 +4,8 @@ import numpy as np
 
 from jawusd.evaluator import JawRig
 from jawusd.fitting import FittingConfig, fit_model
-from jawusd.formats.arkit import FaceCapture
+from jawusd.formats.arkit import JAW_COLUMNS
+from jawusd.formats.face_table import FaceTable
 from jawusd.geometry import make_transform, transform_points
 from jawusd.synthetic.exercises import record, smooth_noise
 from jawusd.synthetic.person import Person
@@ -63,7 +64,8 @@ class Performer:
         rest = transform_points(self.person.pose(0, 0, 0), (incisor + CHIN_MM)[None])[0]
         at = np.arange(int((frames - 1) / JAW_FPS * FACE_FPS) + 1) / FACE_FPS
         moved = np.stack([np.interp(at, np.arange(frames) / JAW_FPS, x) for x in (chin - rest).T], axis=1)
-        face = FaceCapture(at * FACE_FPS, self.face.weights(moved, noise), float(FACE_FPS), "10:00:00:00.000")
+        weights = self.face.weights(moved, noise)
+        face = FaceTable(at * FACE_FPS, weights, JAW_COLUMNS, float(FACE_FPS))
         return face, take.T_true, take.T_noisy
 
     def incisal_error(self, d, times, T_true):
