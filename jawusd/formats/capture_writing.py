@@ -52,7 +52,6 @@ class CaptureSketch:
     cameras: tuple[CameraSketch, ...] = ()
     calibration: PurePath | None = None
     board: BoardSketch | None = None
-    flashes: bool = True  # whether the cameras have clips
 
 
 def capture_text(sketch: CaptureSketch) -> str:

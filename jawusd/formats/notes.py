@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Mapping
-from typing import NamedTuple, Required
+from typing import Required
 
 from pydantic import ConfigDict, TypeAdapter, ValidationError, with_config
 from typing_extensions import TypedDict
@@ -48,22 +48,11 @@ class Registration(TypedDict, total=False):
     T: Required[list[list[float]]]
 
 
-class RegistrationSizes(NamedTuple):
-    """Magnitudes of a `Registration`: shift [mm], turn [deg], and standard deviations, NaN if unknown."""
-
-    shift_mm: float
-    turn_deg: float
-    shift_sigma_mm: float
-    turn_sigma_deg: float
-
-
-def registration_sizes(found: Registration) -> RegistrationSizes:
-    """Return the magnitudes of the shift and the turn of a registration."""
-    shift, turn = math.hypot(*found["shift_mm"]), math.hypot(*found["turn_deg"])
-    unknown = [math.nan]
-    sigma_mm = math.hypot(*found.get("shift_sigma_mm", unknown))
-    sigma_deg = math.hypot(*found.get("turn_sigma_deg", unknown))
-    return RegistrationSizes(shift, turn, sigma_mm, sigma_deg)
+def registration_sizes(found: Registration) -> tuple[float, float, float, float]:
+    """Return the magnitudes of shift [mm] and turn [deg], and of their standard deviations, NaN if unknown."""
+    sigma_mm = math.hypot(*found.get("shift_sigma_mm", [math.nan]))
+    sigma_deg = math.hypot(*found.get("turn_sigma_deg", [math.nan]))
+    return math.hypot(*found["shift_mm"]), math.hypot(*found["turn_deg"]), sigma_mm, sigma_deg
 
 
 class TakeNotes(TypedDict, total=False):

@@ -1,19 +1,24 @@
-"""Contacts of a subject's teeth: both scans as solids, the clearance of poses, and images of the contacts."""
+"""Contacts of a subject's teeth and jaw joints: solids, the clearance of poses, and images of tooth contacts.
+
+In a joint, cartilage and disc separate the bones but are not in the scans, and tracking and model errors are largest at
+the condyles. Clearances of the joints are therefore reported, but never used to reject poses.
+"""
 
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
+from scipy.spatial import cKDTree
 
 from jawusd.base.arrays import Array, Mask
 from jawusd.evaluator import JawRig
 from jawusd.evaluator.contact import AUTHORED_MM, NEAR_MM, UNIT_MM, ContactField
 from jawusd.formats.mesh import BASE, DEEP, TOUCHING, Mesh
+from jawusd.geometry.anatomy import LANDMARKS
 from jawusd.geometry.se3 import se3_inverse, transform_points
 from jawusd.meshes.collision import FARTHEST_MM, STEP_MM, Pair, Solid, distances, solid, tips_box
 
@@ -21,8 +26,19 @@ _CROWN_MM = 14.0  # maximum height of a crown above the gum
 # minimum fraction of lines whose first crossing enters the scan; at least 0.93 for consistent winding
 _LEAST_WOUND = 0.6
 _WIDEST_GAP_MM = 1.0
-_DEEPEST_MM = 2.5
-_COARSEST_MM = 1.5
+_DEEPEST_MM = 2.5  # maximum penetration of teeth, and of a condyle into the skull, in the closed bite
+_COARSEST_MM = 1.5  # maximum median edge length of a scan's triangles
+
+#: Grid step of sampled joint clearances [mm].
+JOINT_STEP_MM = 0.8
+_BONE_GRID_MM = 0.5  # step of the distance grid; clearances differ by at most 0.014 mm from those of a 0.25 mm grid
+# Indices of the left and the right condyle.
+_CONDYLES = [index for index, name in enumerate(LANDMARKS) if name.startswith("condyle")]
+_CONDYLE_MM = 10.0  # radius around the condyle landmark that includes the condylar head but not the coronoid process
+_REACH_MM = 26.0  # maximum translation of the condylar head, which may move past the articular eminence
+_COARSEST_BONE_MM = 4.0  # maximum median edge length of a bone's triangles; a condyle is about 8 mm deep
+_FEWEST_FACES = 30
+_FARTHEST_CONDYLE_MM = 8.0  # maximum distance of a condyle from the skull in the closed bite
 
 _STEP_MM, _MOST_OPENING_MM = 0.3, 16.0  # grid step and maximum mouth opening of sampled tooth clearances
 # Clearance above which the coarse step is used: twice NEAR_MM, the clearance below which errors are measured.
@@ -43,30 +59,41 @@ class NoContact(Exception):
     """Raised if contacts cannot be computed from the scans; the message gives the reason."""
 
 
-class Surfaces(Protocol):
-    """Opposing surfaces of skull and mandible: teeth, or condyles and fossae."""
-
-    @property
-    def closed_mm(self) -> float:
-        """Penetration depth in the closed bite [mm]."""
-
-    def clearances(self, T_skull_mandible: Array) -> Array:
-        """Return the clearance [mm], shape (n,), in poses (n, 4, 4), relative to the closed bite."""
-
-
 @dataclass(frozen=True, eq=False)
-class Teeth:
-    """Both dental arches in the anatomical frame, the lower one in the closed bite."""
+class Surfaces:
+    """Opposing surfaces of skull and mandible in the anatomical frame, the mandible in the closed bite."""
 
-    pair: Pair
-    closed_mm: float  # penetration depth in the closed bite; negative for a gap
+    pairs: tuple[Pair, ...]  # solids: both dental arches, or skull and condyle for the left and the right joint
+    # penetration depth of each pair in the closed bite [mm], shape (P,); negative for gaps, down to
+    # -`collision.FARTHEST_MM`
+    closed: Array
+    zero: Array  # depth of each pair at which its clearance is 0 [mm], shape (P,)
     T_anatomical_skull: Array  # skull to anatomical coordinates, shape (4, 4)
     T_rest: Array  # T_skull_mandible of the closed bite, shape (4, 4)
 
-    def clearances(self, T_skull_mandible: Array) -> Array:
-        """Return the clearance [mm], shape (n,), in poses (n, 4, 4): closed-bite depth minus depth in the pose."""
+    @property
+    def closed_mm(self) -> float:
+        """Penetration depth of the deepest pair in the closed bite [mm]; negative for a gap."""
+        return float(self.closed.max())
+
+    def moved(self, T_skull_mandible: Array) -> Array:
+        """Return the motions (..., 4, 4) of the lower solids from the closed bite to poses (..., 4, 4)."""
         A = self.T_anatomical_skull
-        return self.closed_mm - self.pair.depth(A @ T_skull_mandible @ se3_inverse(A @ self.T_rest))
+        return np.asarray(A @ T_skull_mandible @ se3_inverse(A @ self.T_rest))
+
+    def clearances(self, T_skull_mandible: Array) -> Array:
+        """Return the smallest clearance of the pairs [mm], shape (n,), in poses (n, 4, 4): zero minus depth."""
+        T = self.moved(T_skull_mandible)
+        return np.min([zero - pair.depth(T) for pair, zero in zip(self.pairs, self.zero)], axis=0)
+
+
+class Teeth(Surfaces):
+    """Both dental arches; clearances are relative to the depth in the closed bite."""
+
+    @property
+    def pair(self) -> Pair:
+        """Upper and lower arch."""
+        return self.pairs[0]
 
 
 def find_teeth(upper: Mesh, lower: Mesh, T_anatomical_skull: Array, T_rest: Array) -> Teeth:
@@ -85,32 +112,77 @@ def find_teeth(upper: Mesh, lower: Mesh, T_anatomical_skull: Array, T_rest: Arra
         raise NoContact(
             f"in occlusion, the teeth penetrate each other by {closed:.1f} mm; at most {_DEEPEST_MM:g} mm is allowed"
         )
-    return Teeth(pair, closed, T_anatomical_skull, T_rest)
+    depths = np.array([closed])
+    return Teeth((pair,), depths, depths, T_anatomical_skull, T_rest)
 
 
 def _solid(name: str, mesh: Mesh, T: Array, up: float) -> Solid:
     faces = mesh.faces if mesh.labels is None else mesh.faces[(mesh.labels[mesh.faces] != BASE).all(axis=1)]
     corners = transform_points(T, mesh.vertices)[faces]
-    edges = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
-    if not len(corners) or np.median(edges) > _COARSEST_MM:
-        raise NoContact(
-            f"the {name} scan is too coarse: its edges measure {np.median(edges) if len(edges) else 0:.1f} mm"
-        )
-    return wound_solid(f"{name} scan", corners, up, tips_box(corners, up, _CROWN_MM))
+    if not len(corners) or (edge := _median_edge(corners)) > _COARSEST_MM:
+        raise NoContact(f"the {name} scan is too coarse: its edges measure {edge if len(corners) else 0:.1f} mm")
+    return _wound_solid(f"{name} scan", corners, up, tips_box(corners, up, _CROWN_MM))
 
 
-def wound_solid(name: str, corners: Array, up: float, box: Array, step_mm: float = STEP_MM) -> Solid:
-    """Return the solid of triangles of either winding; see `jawusd.meshes.collision.solid`.
+def _median_edge(corners: Array) -> float:
+    return float(np.median(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)))
 
-    Raises:
-        NoContact: The winding is inconsistent; the message names the mesh.
-    """
+
+def _wound_solid(name: str, corners: Array, up: float, box: Array, step_mm: float = STEP_MM) -> Solid:
+    """Return the solid of triangles of either winding; raise NoContact, naming the mesh, if it is inconsistent."""
     found = solid(corners, up, box, step_mm)
     if found.entering < 0.5:  # flip a mesh that is inside out
         found = solid(np.ascontiguousarray(corners[:, ::-1]), up, box, step_mm)
     if found.entering < _LEAST_WOUND:
         raise NoContact(f"the triangles of the {name} are not consistently wound")
     return found
+
+
+def find_joints(skull: Mesh, mandible: Mesh, landmarks: Array, T_anatomical_skull: Array, T_rest: Array) -> Surfaces:
+    """Return both jaw joints as solids, given both bones and `geometry.LANDMARKS` (5, 3) in their own frames [mm].
+
+    Raises:
+        NoContact: Bone is missing at the condyles or around them, a mesh is too coarse, or a condyle is too far from
+            the skull or penetrates it too deeply.
+    """
+    closed_bite = T_anatomical_skull @ T_rest
+    above = transform_points(T_anatomical_skull, skull.vertices)[skull.faces]
+    below = transform_points(closed_bite, mandible.vertices)[mandible.faces]
+    heads = transform_points(closed_bite, landmarks[_CONDYLES])
+    left, right = (_joint(above, below, head) for head in heads)
+    closed = np.array([float(pair.depth(np.eye(4)[None])[0]) for pair in (left, right)])
+    for pair, depth in zip((left, right), closed):
+        if depth <= -FARTHEST_MM:
+            gap, _ = cKDTree(pair.upper.samples.points).query(pair.lower.samples.points)
+            if gap.min() > _FARTHEST_CONDYLE_MM:
+                raise NoContact(
+                    f"a condyle is {gap.min():.1f} mm from the skull; at most {_FARTHEST_CONDYLE_MM:g} mm is allowed"
+                )
+    if closed.max() > _DEEPEST_MM:
+        raise NoContact(
+            f"in occlusion, a condyle penetrates the skull by {closed.max():.1f} mm; at most "
+            f"{_DEEPEST_MM:g} mm is allowed"
+        )
+    return Surfaces((left, right), closed, np.maximum(closed, 0.0), T_anatomical_skull, T_rest)
+
+
+def _joint(above: Array, below: Array, head: Array) -> Pair:
+    condyle = np.array([head - _CONDYLE_MM, head + _CONDYLE_MM])
+    fossa = np.array([head - _REACH_MM, head + _REACH_MM])
+    _check_fine("mandible", below, condyle)
+    _check_fine("skull", above, fossa)
+    upper = _wound_solid("skull", above, 1.0, fossa, _BONE_GRID_MM)
+    return Pair(upper, _wound_solid("mandible", below, -1.0, condyle, _BONE_GRID_MM))
+
+
+def _check_fine(name: str, corners: Array, box: Array) -> None:
+    """Raise NoContact if a bone is missing or too coarse in a box (2, 3) [mm]."""
+    part = corners[((corners >= box[0]) & (corners <= box[1])).all(axis=2).any(axis=1)]
+    if len(part) < _FEWEST_FACES:
+        raise NoContact(f"the mesh of the {name} has no bone at the condyles")
+    edge = _median_edge(part)
+    if edge > _COARSEST_BONE_MM:
+        raise NoContact(f"the mesh of the {name} is too coarse at the condyles: its edges measure {edge:.1f} mm")
 
 
 def sample_field(
@@ -201,8 +273,7 @@ class ContactMap:
 
     def draw(self, T_skull_mandible: Array) -> Picture:
         """Draw both arches side by side, front teeth at the top, subject's left on the right; return RGB (h, w, 3)."""
-        A, pair = self._teeth.T_anatomical_skull, self._teeth.pair
-        T = A @ T_skull_mandible @ se3_inverse(A @ self._teeth.T_rest)
+        pair, T = self._teeth.pair, self._teeth.moved(T_skull_mandible)
         upper, lower = self._arches
         sides = (
             self._picture(upper, distances(pair.lower.grid, transform_points(se3_inverse(T), upper.points))),

@@ -20,8 +20,7 @@ from jawusd.pipeline.state import Progress, no_progress
 from jawusd.pipeline.subject import BONES, TEETH, Subject
 
 if TYPE_CHECKING:
-    from jawusd.meshes.contact import Teeth
-    from jawusd.meshes.joints import Joints
+    from jawusd.meshes.contact import Surfaces, Teeth
 
 _QUALITY = 88  # JPEG quality of the images
 
@@ -94,10 +93,9 @@ def tooth_solids(meshes: Mapping[str, Mesh], T_anatomical_skull: Array, T_rest: 
 
 def condyle_solids(
     meshes: Mapping[str, Mesh], T_anatomical_skull: Array, landmarks: Array, T_rest: Array
-) -> Joints | str:
+) -> Surfaces | str:
     """Return condyles and skull as solids, or the reason why that failed; see `tooth_solids`."""
-    from jawusd.meshes.contact import NoContact
-    from jawusd.meshes.joints import find_joints
+    from jawusd.meshes.contact import NoContact, find_joints
 
     if any(name not in meshes for name in BONES):
         return "meshes of both skull and mandible are needed"
@@ -128,15 +126,14 @@ def with_tooth_contact(
     return _with_field(model, "contact", field, field.arrays("teeth"))
 
 
-def with_condyle_contact(model: JawModel, joints: Joints | str, progress: Progress = no_progress) -> JawModel:
+def with_condyle_contact(model: JawModel, joints: Surfaces | str, progress: Progress = no_progress) -> JawModel:
     """Return the model with clearances of `condyle_solids` added; ``meta["joints"]`` summarises them."""
-    from jawusd.meshes.contact import sample_field
-    from jawusd.meshes.joints import STEP_MM
+    from jawusd.meshes.contact import JOINT_STEP_MM, sample_field
 
     if isinstance(joints, str):
         model = _with_reason(model, "joints", joints)
     else:
-        field = sample_field(joints, JawRig(model.arrays, model.meta), STEP_MM, np.inf)
+        field = sample_field(joints, JawRig(model.arrays, model.meta), JOINT_STEP_MM, np.inf)
         model = _with_field(model, "joints", field, field.arrays("condyles"))
     progress("contact", 3, 3)
     return model

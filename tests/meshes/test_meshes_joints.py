@@ -6,8 +6,7 @@ import trimesh
 
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry import transform_points
-from jawusd.meshes.contact import NoContact
-from jawusd.meshes.joints import find_joints
+from jawusd.meshes.contact import NoContact, find_joints
 from jawusd.synthetic.anatomy import build_anatomy
 from jawusd.synthetic.person import Person
 
