@@ -1,16 +1,29 @@
-"""Triangle mesh used by all layers, its crown faces and the colours of contacts; common parts of the mesh readers."""
+"""Triangle mesh used by all layers, its crown faces and the colours of contacts, and files of the labels of scans.
+
+Labels of crown, gum and base of a teeth scan are in an npz file beside the scan, format jawusd-scan-labels/1:
+
+    labels (V,) uint8    0 gum, 1 crown, 2 crown at a border of interest, 3 base plate; in the order of the scan file
+    meta                 JSON: scan_sha256 of the scan's vertices, source, weak_share
+
+The hash identifies the version of the scan for which labels were made; they are rejected for any other version.
+"""
 
 from __future__ import annotations
 
+import hashlib
+import json
+import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from jawusd.base.arrays import Array, Mask
-from jawusd.base.errors import CaptureError
+from jawusd.base.errors import FormatError
+from jawusd.base.npz import TWIST_ORDER, UNITS, read_npz, take
+from jawusd.formats.atomic import write_npz_atomic
 
 GUM, TOOTH, BOUNDARY, BASE = 0, 1, 2, 3
 
@@ -114,103 +127,72 @@ TOUCHING = (
 )
 
 
-Indices = NDArray[np.int64]
+LABELS_FAMILY, LABELS_VERSION = "jawusd-scan-labels", 1
+LABELS_SUFFIX = ".labels.npz"
 
-MOST_BYTES = 4 << 30
-MOST_TRIANGLES, MOST_VERTICES = 10_000_000, 30_000_000
-NO_COLOUR = 128  # gray, the colour of vertices without a colour
-
-COPY_AGAIN = "Copy the file again from its source, or export it again."
+LabelSource = Literal["automatic", "reviewed"]
 
 
-class MeshData(NamedTuple):
-    """Mesh as read from a file."""
+@dataclass(frozen=True, eq=False)
+class ScanLabels:
+    """Crown, gum and base labels of one scan."""
 
-    vertices: Array  # vertex positions, shape (V, 3)
-    faces: Indices  # vertex indices of triangles, shape (F, 3); they may exceed the number of vertices
-    colors: NDArray[np.uint8] | None = None  # red, green and blue of each vertex, shape (V, 3)
-    uv: Array | None = None  # texture coordinates of the triangle corners, shape (F, 3, 2)
+    labels: NDArray[np.uint8]  # label of each vertex of the scan file, shape (V,)
+    source: LabelSource  # "automatic" if derived from the shape, "reviewed" if accepted by a user
+    weak_share: float = 0.0  # fraction of the crown-gum border with weak geometric evidence, 0 to 1
 
 
-def read_mesh_bytes(path: Path) -> bytes:
-    """Return the content of a mesh file.
+def labels_path(scan: Path, folder: Path | None = None) -> Path:
+    """Return the path of the labels of a scan: beside the scan, or in a folder of labels."""
+    return (scan.parent if folder is None else folder) / f"{scan.stem}{LABELS_SUFFIX}"
+
+
+def scan_hash(mesh: Mesh) -> str:
+    """Return the SHA-256 of the vertices of a scan, which identifies it in its labels."""
+    return hashlib.sha256(mesh.vertices.tobytes()).hexdigest()
+
+
+def save_scan_labels(path: str | os.PathLike[str], labels: ScanLabels, mesh: Mesh) -> None:
+    """Write the labels of a scan.
 
     Raises:
-        CaptureError: the file is larger than MOST_BYTES.
-        OSError: the file cannot be read.
+        ValueError: the number of labels differs from the number of vertices.
+        OutputError: the file cannot be written.
     """
-    size = path.stat().st_size
-    if size > MOST_BYTES:
-        raise CaptureError(
-            f"is {size:,} bytes long; at most {MOST_BYTES:,} bytes are allowed.", hint="Decimate the mesh."
+    if labels.labels.shape != mesh.vertices.shape[:1]:
+        raise ValueError(f"labels must have shape ({len(mesh.vertices)},), got {labels.labels.shape}")
+    meta = {
+        "format": f"{LABELS_FAMILY}/{LABELS_VERSION}",
+        "units": UNITS,
+        "twist_order": TWIST_ORDER,
+        "scan_sha256": scan_hash(mesh),
+        "source": labels.source,
+        "weak_share": labels.weak_share,
+    }
+    text = json.dumps(meta, sort_keys=True)
+    write_npz_atomic(path, {"labels": labels.labels.astype(np.uint8), "meta": np.array(text)})
+
+
+def load_scan_labels(path: str | os.PathLike[str], mesh: Mesh) -> ScanLabels:
+    """Read the labels of a scan.
+
+    Raises:
+        FormatError: the file does not contain labels, or they were made for another version of the scan.
+        VersionError: the file was written by a newer version.
+    """
+    arrays, meta = read_npz(path, LABELS_FAMILY, LABELS_VERSION)
+    labels = take(arrays, "labels", (None,), path)
+    if meta.get("scan_sha256") != scan_hash(mesh) or len(labels) != len(mesh.vertices):
+        raise FormatError(
+            f"was made for another version of the scan ({len(labels)} vertices; the scan has {len(mesh.vertices)}).",
+            path=path,
+            hint="Create new labels with `jawusd scans --force`, or delete the file.",
         )
-    return path.read_bytes()
-
-
-def check_count(count: int, what: str) -> None:
-    """Check the number of "vertices", "triangles" or "faces" of a file before reading them.
-
-    Raises:
-        CaptureError: the number is too large.
-    """
-    most = MOST_VERTICES if what == "vertices" else MOST_TRIANGLES
-    if count > most:
-        raise CaptureError(f"has {count:,} {what}; at most {most:,} are allowed.", hint="Decimate the mesh.")
-
-
-def cut_off(found: int, said: int, what: str) -> CaptureError:
-    """Return the error for a truncated file."""
-    return CaptureError(f"is truncated: it has {found} of {said} {what}.", hint=COPY_AGAIN)
-
-
-def byte_colors(values: Array) -> NDArray[np.uint8] | None:
-    """Convert colours (n, 3) of 0 to 1, 0 to 255 or 0 to 65535 to bytes, NaN to gray; None for negative values."""
-    top = np.nanmax(values, initial=0.0)
-    if np.nanmin(values, initial=0.0) < 0 or top > 65535:
-        return None  # negative values are not colours but, for example, normals
-    scale = 255.0 if top <= 1 else 1.0 if top <= 255 else 1 / 257
-    return np.where(np.isfinite(values), np.round(values * scale), NO_COLOUR).astype(np.uint8)
-
-
-def cut_polygons(vertices: Array, counts: Indices, corners: Indices) -> tuple[Indices, Indices]:
-    """Triangulate polygons as fans: return the positions (F, 3) of corners in `corners`, and vertices (F, 3).
-
-    A fan starts at the first corner from which all triangles face the same way as the polygon, so that concave quads
-    are correct; polygons with fewer than three corners are dropped. `counts` (P,) are the numbers of corners of each
-    polygon, `corners` (C,) the vertex indices of all.
-    """
-    starts = np.cumsum(counts) - counts
-    triangles, owners = [], []
-    for n in np.unique(counts[counts >= 3]):
-        owner = np.flatnonzero(counts == n)
-        places = starts[owner, None] + np.arange(n)
-        if n > 3:
-            places = np.take_along_axis(places, _fan_starts(vertices, corners[places]), axis=1)
-        fan = np.stack([np.zeros(n - 2, np.int64), np.arange(1, n - 1), np.arange(2, n)], axis=1)
-        triangles.append(places[:, fan].reshape(-1, 3))
-        owners.append(np.repeat(owner, n - 2))
-    if not triangles:
-        return np.zeros((0, 3), np.int64), np.zeros((0, 3), np.int64)
-    order = np.argsort(np.concatenate(owners), kind="stable")
-    found = np.concatenate(triangles)[order]
-    return found, corners[found]
-
-
-def _fan_starts(vertices: Array, polygons: Indices) -> Indices:
-    """Return the corner order of each polygon (m, n), rotated to start at a valid fan apex, shape (m, n)."""
-    m, n = polygons.shape
-    turns = (np.arange(n)[:, None] + np.arange(n)) % n  # row k has all corners, beginning with corner k
-    chosen = np.zeros(m, np.int64)
-    points = vertices[np.clip(polygons, 0, len(vertices) - 1)]
-    open_ones = np.ones(m, bool)
-    with np.errstate(invalid="ignore", over="ignore"):
-        normal = np.cross(points, np.roll(points, -1, axis=1)).sum(axis=1)
-        for k in range(n):
-            around = points[:, turns[k]]
-            sides = around[:, 1:] - around[:, :1]
-            facing = np.einsum("mti,mi->mt", np.cross(sides[:, :-1], sides[:, 1:]), normal)
-            fits = open_ones & (facing >= 0).all(axis=1)
-            chosen[fits], open_ones = k, open_ones & ~fits
-            if not open_ones.any():
-                break
-    return turns[chosen]
+    if not np.isin(labels, range(BASE + 1)).all():
+        raise FormatError(f'"labels" must be 0 to {BASE}, found {labels.max():g}.', path=path)
+    source, weak = meta.get("source"), meta.get("weak_share", 0.0)
+    if source != "automatic" and source != "reviewed":
+        raise FormatError(f'source is "{source}"; it must be "automatic" or "reviewed".', path=path)
+    if isinstance(weak, bool) or not isinstance(weak, int | float) or not 0 <= weak <= 1:
+        raise FormatError(f'weak_share is "{weak}"; it must be a number from 0 to 1.', path=path)
+    return ScanLabels(labels.astype(np.uint8), source, float(weak))

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from jawusd.base.arrays import Array
 from jawusd.base.errors import CaptureError, errors_name_file
-from jawusd.formats.mesh import (
+from jawusd.formats.mesh_reading import (
     Indices,
     MeshData,
     byte_colors,

@@ -16,10 +16,9 @@ from jawusd.base.arrays import Array
 from jawusd.base.errors import CaptureError, errors_name_file, explain_missing_packages
 from jawusd.base.inputs import check_input, why_unreadable
 from jawusd.formats.file_names import MESHES
-from jawusd.formats.mesh import NO_COLOUR, Mesh, MeshData, tooth_labels, without_loose
-from jawusd.formats.mesh_obj import read_obj
+from jawusd.formats.mesh import Mesh, tooth_labels, without_loose
 from jawusd.formats.mesh_ply import read_ply
-from jawusd.formats.mesh_stl import read_stl
+from jawusd.formats.mesh_reading import NO_COLOUR, MeshData, read_obj, read_stl
 from jawusd.geometry.points import welded
 
 # Winding, tooth_labels and winding are re-exported for scripts that read and label scans.

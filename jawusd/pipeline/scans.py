@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from jawusd.base.errors import explain_missing_packages
 from jawusd.formats.atomic import refuse_existing
 from jawusd.formats.capture import Capture, Scans
-from jawusd.formats.mesh import Mesh, painted_labels, tooth_labels
-from jawusd.formats.scan_labels import ScanLabels, labels_path, save_scan_labels
+from jawusd.formats.mesh import Mesh, ScanLabels, labels_path, painted_labels, save_scan_labels, tooth_labels
 from jawusd.geometry import anatomical_frame
 from jawusd.pipeline.state import Progress, no_progress
 from jawusd.pipeline.subject import TEETH, LabelledScan, labelled_teeth, read_files

@@ -16,9 +16,8 @@ from jawusd.base.errors import CaptureError, explain_missing_packages
 from jawusd.formats.capture import Capture
 from jawusd.formats.finding import Finding
 from jawusd.formats.landmarks import load_landmarks
-from jawusd.formats.mesh import GUM, Mesh, painted_labels, tooth_labels
+from jawusd.formats.mesh import GUM, Mesh, ScanLabels, labels_path, load_scan_labels, painted_labels, tooth_labels
 from jawusd.formats.model import load_model
-from jawusd.formats.scan_labels import ScanLabels, labels_path, load_scan_labels
 from jawusd.geometry import LANDMARKS, anatomical_frame, find_landmarks, landmark_frame, transform_points
 from jawusd.geometry.anatomy import MEAN_CONDYLES
 

@@ -16,7 +16,7 @@ from jawusd.base.version import __version__
 from jawusd.cameras.files import calibration_files
 from jawusd.formats.capture import Capture, load_capture
 from jawusd.formats.file_names import is_pattern, numbered_files
-from jawusd.formats.scan_labels import labels_path
+from jawusd.formats.mesh import labels_path
 from jawusd.pipeline.state import (
     BUILD_FILE,
     LOCK_FILE,

@@ -7,8 +7,19 @@ import numpy as np
 import pytest
 
 from jawusd.base.errors import FormatError, OutputError, VersionError
-from jawusd.formats.mesh import BASE, BOUNDARY, GUM, TOOTH, Mesh, crown_face_mask, tooth_labels
-from jawusd.formats.scan_labels import ScanLabels, labels_path, load_scan_labels, save_scan_labels
+from jawusd.formats.mesh import (
+    BASE,
+    BOUNDARY,
+    GUM,
+    TOOTH,
+    Mesh,
+    ScanLabels,
+    crown_face_mask,
+    labels_path,
+    load_scan_labels,
+    save_scan_labels,
+    tooth_labels,
+)
 
 
 def strip() -> Mesh:

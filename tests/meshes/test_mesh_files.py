@@ -25,7 +25,7 @@ from mesh_writers import (
 )
 
 from jawusd.base.errors import CaptureError
-from jawusd.formats import mesh
+from jawusd.formats import mesh_reading
 from jawusd.meshes.meshio import load_mesh
 
 # ---------------------------------------------------------------------------------------------------------------- PLY
@@ -267,7 +267,7 @@ def test_counts_are_capped_before_anything_is_read(tmp_path: Path, monkeypatch: 
         (tmp_path / "a.ply").write_bytes(head.replace(old, new))
         with pytest.raises(CaptureError, match=words):
             load_mesh(tmp_path / "a.ply")
-    monkeypatch.setattr(mesh, "MOST_TRIANGLES", 191)
+    monkeypatch.setattr(mesh_reading, "MOST_TRIANGLES", 191)
     for name, data in (
         ("a.ply", ply("<", MIXED)),
         ("a.stl", stl()),
@@ -277,6 +277,6 @@ def test_counts_are_capped_before_anything_is_read(tmp_path: Path, monkeypatch: 
         (tmp_path / name).write_bytes(data)
         with pytest.raises(CaptureError, match="has 192 triangles; at most 191 are"):
             load_mesh(tmp_path / name)
-    monkeypatch.setattr(mesh, "MOST_BYTES", 100)
+    monkeypatch.setattr(mesh_reading, "MOST_BYTES", 100)
     with pytest.raises(CaptureError, match="bytes long; at most 100 bytes are"):
         load_mesh(tmp_path / "a.stl")

@@ -13,8 +13,18 @@ from typer.testing import CliRunner
 from jawusd.base.errors import FormatError, OutputError
 from jawusd.cli.main import app
 from jawusd.formats.capture import load_capture
-from jawusd.formats.mesh import BASE, GUM, TOOTH, Mesh, crown_face_mask, tooth_labels
-from jawusd.formats.scan_labels import ScanLabels, labels_path, load_scan_labels, save_scan_labels
+from jawusd.formats.mesh import (
+    BASE,
+    GUM,
+    TOOTH,
+    Mesh,
+    ScanLabels,
+    crown_face_mask,
+    labels_path,
+    load_scan_labels,
+    save_scan_labels,
+    tooth_labels,
+)
 from jawusd.meshes.meshio import load_mesh
 from jawusd.pipeline.scans import all_labelled, label_scans, save_reviewed, store_labels, with_stored_labels
 from jawusd.pipeline.subject import label_teeth, load_labelled, load_meshes

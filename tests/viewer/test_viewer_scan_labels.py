@@ -9,8 +9,7 @@ from package_copy import ROOT
 from quiet_capture_page import QuietCapturePage
 
 from jawusd.formats.capture import load_capture
-from jawusd.formats.mesh import BASE, GUM, TOOTH, Mesh, crown_face_mask, tooth_labels
-from jawusd.formats.scan_labels import labels_path, load_scan_labels
+from jawusd.formats.mesh import BASE, GUM, TOOTH, Mesh, crown_face_mask, labels_path, load_scan_labels, tooth_labels
 from jawusd.geometry import transform_point
 from jawusd.pipeline.state import no_progress
 from jawusd.pipeline.subject import load_labelled
