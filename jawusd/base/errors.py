@@ -12,7 +12,10 @@ from functools import partial, wraps
 from os import PathLike
 from typing import Concatenate, ParamSpec, TypeVar
 
-_Path = TypeVar("_Path", bound=str | PathLike[str])
+#: A path as text or as an object.
+AnyPath = str | PathLike[str]
+
+_Path = TypeVar("_Path", bound=AnyPath)
 _Rest = ParamSpec("_Rest")
 _Read = TypeVar("_Read")
 
@@ -65,7 +68,7 @@ class JawusdError(Exception):
         self,
         message: str,
         *,
-        path: str | PathLike[str] | None = None,
+        path: AnyPath | None = None,
         camera: str | None = None,
         frame: int | None = None,
         hint: str | None = None,
@@ -173,7 +176,7 @@ class ResourceError(JawusdError):
 
 
 @contextlib.contextmanager
-def naming_file(path: str | PathLike[str]) -> Iterator[None]:
+def naming_file(path: AnyPath) -> Iterator[None]:
     """Add a file's path to errors that have none."""
     try:
         yield

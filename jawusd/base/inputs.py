@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from contextvars import ContextVar
 from pathlib import Path
 
-from jawusd.base.errors import FormatError, JawusdError
+from jawusd.base.errors import AnyPath, FormatError, JawusdError
 from jawusd.base.guard import note_input
 
 _LFS = b"version https://git-lfs"
@@ -18,7 +18,7 @@ SETTING = "JAWUSD_ALLOW"
 _given: ContextVar[tuple[Path, ...]] = ContextVar("allowed_folders", default=())
 
 
-def check_input(path: str | os.PathLike[str], error: type[JawusdError] = FormatError) -> None:
+def check_input(path: AnyPath, error: type[JawusdError] = FormatError) -> None:
     """Check that an input is a regular file, and record it for crash reports; the reader reports missing files.
 
     Reading an idle pipe would block, and reading a device may never end. Anonymous pipes are allowed: shells use them
@@ -37,7 +37,7 @@ def check_input(path: str | os.PathLike[str], error: type[JawusdError] = FormatE
         raise error("is not a regular file.", path=path, hint="Give a file, not a folder, pipe or device.")
 
 
-def why_unreadable(path: str | os.PathLike[str]) -> tuple[str, str] | None:
+def why_unreadable(path: AnyPath) -> tuple[str, str] | None:
     """Return message and hint for a file that is empty or a Git LFS pointer; None for other files."""
     with open(path, "rb") as file:
         head = file.read(len(_LFS))
@@ -48,7 +48,7 @@ def why_unreadable(path: str | os.PathLike[str]) -> tuple[str, str] | None:
     return None
 
 
-def check_path(path: str | os.PathLike[str], error: type[JawusdError]) -> None:
+def check_path(path: AnyPath, error: type[JawusdError]) -> None:
     """Check that OpenUSD can open a path, which must be UTF-8 without control characters.
 
     Raises:
@@ -70,7 +70,7 @@ def check_path(path: str | os.PathLike[str], error: type[JawusdError]) -> None:
         ) from None
 
 
-def allow_folders(folders: Iterable[str | os.PathLike[str]]) -> None:
+def allow_folders(folders: Iterable[AnyPath]) -> None:
     """Allow stages to reference files in these folders and those of the environment variable, subfolders included.
 
     The folders of earlier calls are replaced.

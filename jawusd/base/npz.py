@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import lzma
-import os
 import struct
 import tokenize
 import zipfile
@@ -15,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from jawusd.base.arrays import Array
-from jawusd.base.errors import FormatError, UnitsError, VersionError
+from jawusd.base.errors import AnyPath, FormatError, UnitsError, VersionError
 from jawusd.base.inputs import check_input
 
 UNITS = {"length": "mm", "angle": "rad"}
@@ -35,7 +34,7 @@ DAMAGED = (
 )  # fmt: skip
 
 
-def read_npz(path: str | os.PathLike[str], family: str, version: int) -> tuple[NamedArrays, JsonObject]:
+def read_npz(path: AnyPath, family: str, version: int) -> tuple[NamedArrays, JsonObject]:
     """Read the arrays and metadata of a jawusd npz file, and check format, version and units.
 
     Args:
@@ -62,7 +61,7 @@ def read_npz(path: str | os.PathLike[str], family: str, version: int) -> tuple[N
     return arrays, meta
 
 
-def read_arrays(path: str | os.PathLike[str]) -> NamedArrays:
+def read_arrays(path: AnyPath) -> NamedArrays:
     """Read the arrays of an npz file of any program; nothing is unpickled.
 
     Raises:
@@ -88,7 +87,7 @@ def read_arrays(path: str | os.PathLike[str]) -> NamedArrays:
     return arrays
 
 
-def check_format(found: object, family: str, version: int, path: str | os.PathLike[str]) -> int:
+def check_format(found: object, family: str, version: int, path: AnyPath) -> int:
     """Check a format label such as ``"jawusd-tracks/1"`` and return its version.
 
     Raises:
@@ -109,7 +108,7 @@ def check_format(found: object, family: str, version: int, path: str | os.PathLi
     return int(number)
 
 
-def check_units(meta: Mapping[str, object], path: str | os.PathLike[str]) -> None:
+def check_units(meta: Mapping[str, object], path: AnyPath) -> None:
     """Check the units and the twist order in a file's metadata.
 
     Raises:

@@ -7,7 +7,6 @@ the last two map world to camera coordinates. Pose2Sim names the tables after it
 
 from __future__ import annotations
 
-import os
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -15,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from jawusd.base.arrays import Array
-from jawusd.base.errors import CalibrationError, errors_name_file
+from jawusd.base.errors import AnyPath, CalibrationError, errors_name_file
 from jawusd.cameras.files import CameraFormat, Size, check_lens_model
 from jawusd.formats.atomic import write_text_atomic
 from jawusd.formats.text import read_toml
@@ -39,7 +38,7 @@ _CAMERA_TABLE = re.compile(r"^cam_\d+$")
 
 
 @errors_name_file
-def load_calibration(path: str | os.PathLike[str]) -> list[Camera]:
+def load_calibration(path: AnyPath) -> list[Camera]:
     """Read the cameras of a calibration file.
 
     Raises:
@@ -106,7 +105,7 @@ def _camera(table: str, values: object) -> Camera:
     return Camera(name, (int(size[0]), int(size[1])), K, distortion, make_transform(rotation, translation))
 
 
-def save_calibration(path: str | os.PathLike[str], cameras: list[Camera]) -> None:
+def save_calibration(path: AnyPath, cameras: list[Camera]) -> None:
     """Write cameras as aniposelib TOML, atomically.
 
     Raises:

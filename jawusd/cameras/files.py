@@ -7,7 +7,6 @@ here: names, sizes, lens models, XML and numbers.
 
 from __future__ import annotations
 
-import os
 import pkgutil
 import re
 from collections import Counter
@@ -21,7 +20,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from jawusd.base.arrays import Array
-from jawusd.base.errors import CalibrationError, naming_file
+from jawusd.base.errors import AnyPath, CalibrationError, naming_file
 from jawusd.base.inputs import check_input
 from jawusd.base.tables import read_text
 from jawusd.geometry import Camera, make_transform, orthonormalise, rigidity_defect, se3_inverse
@@ -256,9 +255,7 @@ def _format_of(path: Path) -> CameraFormat:
     return max(_formats(), key=lambda one: one.reads(path))  # in a tie, the first one: `calibration`
 
 
-def load_cameras_file(
-    path: str | os.PathLike[str], unit_mm: float = 1.0, sizes: Mapping[str, Size] | None = None
-) -> list[Camera]:
+def load_cameras_file(path: AnyPath, unit_mm: float = 1.0, sizes: Mapping[str, Size] | None = None) -> list[Camera]:
     """Read cameras from a calibration in any supported format, in file order; lengths in mm, OpenCV axes and pixels.
 
     Args:

@@ -33,7 +33,6 @@ The identity is the closed mouth with the teeth in occlusion. Other arrays are i
 from __future__ import annotations
 
 import json
-import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
@@ -42,7 +41,7 @@ import numpy as np
 from pydantic import Field
 
 from jawusd.base.arrays import Array
-from jawusd.base.errors import FormatError
+from jawusd.base.errors import AnyPath, FormatError
 from jawusd.base.npz import read_arrays, take
 from jawusd.formats.atomic import write_text_atomic
 from jawusd.formats.poses import read_poses
@@ -118,7 +117,7 @@ def motion_of_points(points: Array) -> Array:
     return np.concatenate([-hat(p), unit, p[..., None]], axis=-1)
 
 
-def load_correspondences(path: str | os.PathLike[str]) -> Correspondences:
+def load_correspondences(path: AnyPath) -> Correspondences:
     """Read corresponding points.
 
     Raises:
@@ -128,7 +127,7 @@ def load_correspondences(path: str | os.PathLike[str]) -> Correspondences:
     return read_model(path, _MAX_BYTES, Correspondences, hint)
 
 
-def load_alignment(path: str | os.PathLike[str]) -> Alignment:
+def load_alignment(path: AnyPath) -> Alignment:
     """Read an alignment.
 
     Raises:
@@ -140,7 +139,7 @@ def load_alignment(path: str | os.PathLike[str]) -> Alignment:
     return found
 
 
-def save_alignment(path: str | os.PathLike[str], alignment: Alignment) -> None:
+def save_alignment(path: AnyPath, alignment: Alignment) -> None:
     """Write an alignment atomically.
 
     Raises:
@@ -170,7 +169,7 @@ class JawTrack:
         return poses
 
 
-def read_jaw_track(path: str | os.PathLike[str], joint: tuple[float, float, float] | None) -> JawTrack:
+def read_jaw_track(path: AnyPath, joint: tuple[float, float, float] | None) -> JawTrack:
     """Read the jaw motion of a face model; `joint` [model units] is used if the file does not contain it.
 
     Raises:

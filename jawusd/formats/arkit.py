@@ -16,7 +16,6 @@ was detected. Frame numbers of the result are 0 in the first row, and may be fra
 from __future__ import annotations
 
 import math
-import os
 import re
 from pathlib import Path
 
@@ -24,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jawusd.base.arrays import Array
-from jawusd.base.errors import FormatError, errors_name_file
+from jawusd.base.errors import AnyPath, FormatError, errors_name_file
 from jawusd.base.tables import TextTable, check_width, read_table
 from jawusd.formats.face_table import FaceTable
 
@@ -51,7 +50,7 @@ def shares_of(weights: Array) -> Array:
 
 
 @errors_name_file
-def read_arkit(path: str | os.PathLike[str], fps: float | None = None) -> FaceTable:
+def read_arkit(path: AnyPath, fps: float | None = None) -> FaceTable:
     """Read the weights of `JAW_COLUMNS` from a face capture (CSV) of Live Link Face; left is the subject's left.
 
     Args:
@@ -67,7 +66,7 @@ def read_arkit(path: str | os.PathLike[str], fps: float | None = None) -> FaceTa
 
 
 @errors_name_file
-def read_blend_shapes(path: str | os.PathLike[str], fps: float | None = None) -> FaceTable:
+def read_blend_shapes(path: AnyPath, fps: float | None = None) -> FaceTable:
     """Read all blend shapes of a face capture of Live Link Face (see `read_arkit`); rotations are left out.
 
     Raises:

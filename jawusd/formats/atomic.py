@@ -14,7 +14,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from jawusd.base.errors import OutputError, shown
+from jawusd.base.errors import AnyPath, OutputError, shown
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -28,7 +28,7 @@ ELSEWHERE = "Choose a folder where you have write access."
 _UNSUPPORTED = (errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.EINVAL, errno.EPERM)
 
 
-def destination(path: str | os.PathLike[str]) -> Path:
+def destination(path: AnyPath) -> Path:
     """Return the file to which an output is written: the path or, for a link within its folder, the link's target.
 
     Raises:
@@ -107,7 +107,7 @@ def open_stream(path: Path) -> int:
 
 
 @contextlib.contextmanager
-def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
+def atomic_path(path: AnyPath) -> Iterator[Path]:
     """Yield a temporary path with the same suffix, and rename it to `path` if the block succeeds.
 
     Missing folders are created. Links are resolved by `destination`. Pipes and devices get the finished content.
@@ -157,7 +157,7 @@ def _unless_unsupported() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def scratch_folder(beside: str | os.PathLike[str]) -> Iterator[Path]:
+def scratch_folder(beside: AnyPath) -> Iterator[Path]:
     """Yield a temporary folder beside an output file, and delete it at the end of the block.
 
     Raises:
@@ -177,7 +177,7 @@ def scratch_folder(beside: str | os.PathLike[str]) -> Iterator[Path]:
         shutil.rmtree(folder, ignore_errors=True)
 
 
-def clear_unfinished(folder: str | os.PathLike[str]) -> None:
+def clear_unfinished(folder: AnyPath) -> None:
     """Delete unfinished outputs of killed runs in a folder and its subfolders; no other process may write there."""
     for left in list(Path(folder).rglob(f"{_UNFINISHED}*")):
         if left.is_dir() and not left.is_symlink():
@@ -196,7 +196,7 @@ def _sync_folder(folder: Path) -> None:
             os.close(handle)
 
 
-def write_bytes_atomic(path: str | os.PathLike[str], data: bytes) -> None:
+def write_bytes_atomic(path: AnyPath, data: bytes) -> None:
     """Write bytes to a file atomically.
 
     Raises:
@@ -206,7 +206,7 @@ def write_bytes_atomic(path: str | os.PathLike[str], data: bytes) -> None:
         temporary.write_bytes(data)
 
 
-def write_text_atomic(path: str | os.PathLike[str], text: str) -> None:
+def write_text_atomic(path: AnyPath, text: str) -> None:
     """Write UTF-8 text to a file atomically.
 
     Raises:
@@ -222,9 +222,7 @@ def write_text_atomic(path: str | os.PathLike[str], text: str) -> None:
     write_bytes_atomic(path, data)
 
 
-def write_csv_atomic(
-    path: str | os.PathLike[str], columns: Sequence[str], rows: Iterable[Mapping[str, object]]
-) -> None:
+def write_csv_atomic(path: AnyPath, columns: Sequence[str], rows: Iterable[Mapping[str, object]]) -> None:
     """Write a table with a header as CSV atomically; control characters in its text are escaped.
 
     Raises:
@@ -237,7 +235,7 @@ def write_csv_atomic(
     write_text_atomic(path, text.getvalue())
 
 
-def write_npz_atomic(path: str | os.PathLike[str], arrays: Mapping[str, ArrayLike], *, packed: bool = True) -> None:
+def write_npz_atomic(path: AnyPath, arrays: Mapping[str, ArrayLike], *, packed: bool = True) -> None:
     """Write arrays in C order as an npz file, `packed` by compression, atomically; equal arrays give equal bytes.
 
     Raises:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import Field, ValidationError, field_validator, model_validator
 
-from jawusd.base.errors import FormatError, JawusdError, UnitsError
+from jawusd.base.errors import AnyPath, FormatError, JawusdError, UnitsError
 from jawusd.base.npz import check_format
 from jawusd.formats.capture_keys import Key, KeyEntry, entries, problems_of
 from jawusd.formats.capture_parts import Boards, CameraSource, Scans, resolve_paths, similar_names
@@ -253,7 +252,7 @@ def capture_keys() -> list[KeyEntry]:
     return out
 
 
-def load_capture(path: str | os.PathLike[str], *, allow_outside: bool = False) -> Capture:
+def load_capture(path: AnyPath, *, allow_outside: bool = False) -> Capture:
     """Read a `capture.toml`, given its path or folder; paths in the result are absolute.
 
     Raises:
@@ -268,9 +267,7 @@ def load_capture(path: str | os.PathLike[str], *, allow_outside: bool = False) -
     return capture
 
 
-def read_capture(
-    path: str | os.PathLike[str], *, allow_outside: bool = False
-) -> tuple[Capture | None, list[JawusdError]]:
+def read_capture(path: AnyPath, *, allow_outside: bool = False) -> tuple[Capture | None, list[JawusdError]]:
     """Read a capture like `load_capture`, but return all problems instead of raising the first; None without values."""
     path = Path(path)
     if path.is_dir():

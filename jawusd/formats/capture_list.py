@@ -17,7 +17,7 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
-from jawusd.base.errors import FormatError, errors_name_file
+from jawusd.base.errors import AnyPath, FormatError, errors_name_file
 from jawusd.formats.text import read_text
 
 _MAX_BYTES = 16 << 20
@@ -33,7 +33,7 @@ class ListedCapture:
 
 
 @errors_name_file
-def load_capture_list(path: str | os.PathLike[str]) -> list[ListedCapture]:
+def load_capture_list(path: AnyPath) -> list[ListedCapture]:
     """Read a list of captures.
 
     Raises:

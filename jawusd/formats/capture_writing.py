@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import tomllib
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -11,7 +10,7 @@ from pathlib import Path, PurePath
 
 from pydantic import ValidationError
 
-from jawusd.base.errors import FormatError, OutputError
+from jawusd.base.errors import AnyPath, FormatError, OutputError
 from jawusd.base.inputs import check_input
 from jawusd.formats.atomic import write_bytes_atomic
 from jawusd.formats.capture import Bootstrap
@@ -161,7 +160,7 @@ def _board(sketch: CaptureSketch) -> Iterable[str]:
 _TABLE = "bootstrap"
 
 
-def write_bootstrap(path: str | os.PathLike[str], picks: Bootstrap, expected: Bootstrap | None) -> None:
+def write_bootstrap(path: AnyPath, picks: Bootstrap, expected: Bootstrap | None) -> None:
     """Replace or add `[bootstrap]` of a capture.toml, if its picked points are still the expected ones.
 
     Raises:

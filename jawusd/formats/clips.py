@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jawusd.base.arrays import Array
-from jawusd.base.errors import CaptureError
+from jawusd.base.errors import AnyPath, CaptureError
 
 _CODE = re.compile(r"(\d{1,2}):(\d{2}):(\d{2})([:;.,])(\d{2,3})")
 _HOURS_PER_DAY = 24
@@ -96,7 +96,7 @@ def frame_of_timecode(text: str, fps: float) -> int:
     return total - dropped * (whole - whole // 10)
 
 
-def timecode_rates(path: str | os.PathLike[str]) -> list[Fraction]:
+def timecode_rates(path: AnyPath) -> list[Fraction]:
     """Return the frame rates of a file's time code tracks; empty for other files.
 
     Raises:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 
 import numpy as np
 
 from jawusd.base.arrays import Array
+from jawusd.base.errors import AnyPath
 from jawusd.formats.atomic import write_csv_atomic
 
 TABLE_COLUMNS = ("experiment", "model", "quantity", "count", "mean_mm", "median_mm", "p95_mm", "max_mm")
@@ -94,7 +94,7 @@ class Experiments:
         return [found.row() for found in self.distances]
 
 
-def save_table(path: str | os.PathLike[str], rows: list[dict[str, str | int | float]]) -> None:
+def save_table(path: AnyPath, rows: list[dict[str, str | int | float]]) -> None:
     """Write a table of experiments as CSV, atomically.
 
     Raises:

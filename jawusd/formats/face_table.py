@@ -8,7 +8,6 @@ The first row names the columns; one of them is `frame` or `time_s`. Blank cells
 
 from __future__ import annotations
 
-import os
 import re
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from jawusd.base.arrays import Array
-from jawusd.base.errors import FormatError, errors_name_file, naming_file
+from jawusd.base.errors import AnyPath, FormatError, errors_name_file, naming_file
 from jawusd.base.tables import TextTable, check_width, read_table, read_text, split_rows
 
 _MAX_BYTES = 1 << 30
@@ -37,7 +36,7 @@ class FaceTable:
 
 
 @errors_name_file
-def header_of(path: str | os.PathLike[str]) -> list[str]:
+def header_of(path: AnyPath) -> list[str]:
     """Return the cells of the first row of a text table, in lower case.
 
     Raises:
@@ -55,7 +54,7 @@ def is_face_table(header: list[str]) -> bool:
 
 
 @errors_name_file
-def read_face_table(path: str | os.PathLike[str]) -> FaceTable:
+def read_face_table(path: AnyPath) -> FaceTable:
     """Read a face table.
 
     Raises:
@@ -65,7 +64,7 @@ def read_face_table(path: str | os.PathLike[str]) -> FaceTable:
     return _face_of(read_table(Path(path), _MAX_BYTES))
 
 
-def read_face_row(header: str, row: str, number: int, path: str | os.PathLike[str]) -> FaceTable:
+def read_face_row(header: str, row: str, number: int, path: AnyPath) -> FaceTable:
     """Read one row, the line of a given number, of a face table that is read while it is written.
 
     Raises:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -17,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jawusd.base.arrays import Array
+from jawusd.base.errors import AnyPath
 from jawusd.formats.atomic import write_bytes_atomic
 from jawusd.geometry.so3 import continuous_wxyz
 
@@ -59,7 +59,7 @@ class Node:
 
 
 def save_glb(
-    path: str | os.PathLike[str],
+    path: AnyPath,
     name: str,
     materials: Mapping[str, Material],
     nodes: Sequence[Node],
@@ -106,7 +106,7 @@ def save_glb(
     write_bytes_atomic(path, _container(document, bytes(builder.data)))
 
 
-def frame_rate(path: str | os.PathLike[str]) -> float | None:
+def frame_rate(path: AnyPath) -> float | None:
     """Return the frame rate in the animation metadata of a .glb from `save_glb`; None for other files."""
     try:
         with open(path, "rb") as file:

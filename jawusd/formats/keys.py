@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import json
-import os
 from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import Field, model_validator
 
 from jawusd.base.arrays import Array
+from jawusd.base.errors import AnyPath
 from jawusd.formats.atomic import write_text_atomic
 from jawusd.formats.text import Strict, read_model
 
@@ -66,7 +66,7 @@ class Keys(Strict):
         return np.array([[np.nan] * 3 if key.tangents is None else key.tangents for key in self.keys], dtype=np.float64)
 
 
-def load_keys(path: str | os.PathLike[str]) -> Keys:
+def load_keys(path: AnyPath) -> Keys:
     """Read animation keys.
 
     Raises:
@@ -75,7 +75,7 @@ def load_keys(path: str | os.PathLike[str]) -> Keys:
     return read_model(path, _MAX_BYTES, Keys)
 
 
-def save_keys(path: str | os.PathLike[str], keys: Keys) -> None:
+def save_keys(path: AnyPath, keys: Keys) -> None:
     """Write animation keys atomically.
 
     Raises:

@@ -11,14 +11,13 @@ anatomical frame is optional.
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from jawusd.base.arrays import Array
-from jawusd.base.errors import FormatError, UnitsError, errors_name_file
+from jawusd.base.errors import AnyPath, FormatError, UnitsError, errors_name_file
 from jawusd.base.npz import check_format
 from jawusd.formats.text import read_json
 from jawusd.geometry import LANDMARKS, rigidity_defect
@@ -38,7 +37,7 @@ class LandmarkFile:
 
 
 @errors_name_file
-def load_landmarks(path: str | os.PathLike[str]) -> LandmarkFile:
+def load_landmarks(path: AnyPath) -> LandmarkFile:
     """Read landmarks.
 
     Raises:

@@ -27,7 +27,7 @@ from pathlib import Path
 import numpy as np
 
 from jawusd.base.arrays import Array, Mask
-from jawusd.base.errors import FormatError, UnitsError, errors_name_file
+from jawusd.base.errors import AnyPath, FormatError, UnitsError, errors_name_file
 from jawusd.base.tables import read_text, split_rows, to_numbers
 from jawusd.formats.file_names import is_pattern, numbered_files
 
@@ -79,7 +79,7 @@ def mark_hidden(points: Array, zeros: bool = True) -> Array:
 
 
 @errors_name_file
-def read_markers(path: str | os.PathLike[str]) -> MarkerTable:
+def read_markers(path: AnyPath) -> MarkerTable:
     """Read marker positions from a table, or from a pattern (`Marker%d_Traj.txt`) of numbered tables of equal length.
 
     Raises:
@@ -305,7 +305,7 @@ class RigidBody:
 
 
 @errors_name_file
-def read_body(description: str | os.PathLike[str]) -> RigidBody:
+def read_body(description: AnyPath) -> RigidBody:
     """Read a rigid body: a marker description file (.rig), or the numbers or names of its markers (`5,6,7,8`).
 
     Raises:

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, NamedTuple
@@ -21,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jawusd.base.arrays import Array, Mask
-from jawusd.base.errors import FormatError
+from jawusd.base.errors import AnyPath, FormatError
 from jawusd.base.npz import TWIST_ORDER, UNITS, read_npz, take
 from jawusd.formats.atomic import write_npz_atomic
 
@@ -152,7 +151,7 @@ def scan_hash(mesh: Mesh) -> str:
     return hashlib.sha256(mesh.vertices.tobytes()).hexdigest()
 
 
-def save_scan_labels(path: str | os.PathLike[str], labels: ScanLabels, mesh: Mesh) -> None:
+def save_scan_labels(path: AnyPath, labels: ScanLabels, mesh: Mesh) -> None:
     """Write the labels of a scan.
 
     Raises:
@@ -173,7 +172,7 @@ def save_scan_labels(path: str | os.PathLike[str], labels: ScanLabels, mesh: Mes
     write_npz_atomic(path, {"labels": labels.labels.astype(np.uint8), "meta": np.array(text)})
 
 
-def load_scan_labels(path: str | os.PathLike[str], mesh: Mesh) -> ScanLabels:
+def load_scan_labels(path: AnyPath, mesh: Mesh) -> ScanLabels:
     """Read the labels of a scan.
 
     Raises:

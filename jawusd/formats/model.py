@@ -6,7 +6,6 @@ The decoder arrays (`JawModel.arrays`) have the names of the evaluator, which va
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import cast
@@ -15,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jawusd.base.arrays import Array, Mask
+from jawusd.base.errors import AnyPath
 from jawusd.base.npz import TWIST_ORDER, UNITS, read_npz, take, upgraded_model
 from jawusd.formats.atomic import write_npz_atomic
 from jawusd.formats.notes import ErrorTable, ModelMeta, check_notes
@@ -56,7 +56,7 @@ class JawModel:
         return cast(ModelMeta, self.meta)
 
 
-def save_model(path: str | os.PathLike[str], model: JawModel) -> None:
+def save_model(path: AnyPath, model: JawModel) -> None:
     """Write a model atomically.
 
     Raises:
@@ -72,7 +72,7 @@ def save_model(path: str | os.PathLike[str], model: JawModel) -> None:
     write_npz_atomic(path, {**model.arrays, **captured, "meta": np.array(json.dumps(meta, sort_keys=True))})
 
 
-def load_model(path: str | os.PathLike[str]) -> JawModel:
+def load_model(path: AnyPath) -> JawModel:
     """Read a model.
 
     Raises:

@@ -6,14 +6,13 @@ Every value is optional: other programs and older versions omit some values or a
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Mapping
 from typing import Required
 
 from pydantic import ConfigDict, TypeAdapter, ValidationError, with_config
 from typing_extensions import TypedDict
 
-from jawusd.base.errors import FormatError
+from jawusd.base.errors import AnyPath, FormatError
 from jawusd.formats.text import Frames
 
 ErrorTable = dict[str, dict[str, float]]
@@ -122,9 +121,7 @@ class SyncNotes(TypedDict, total=False):
     confidence: dict[str, float]
 
 
-def check_notes(
-    meta: Mapping[str, object], kind: type[TracksMeta] | type[ModelMeta], path: str | os.PathLike[str]
-) -> None:
+def check_notes(meta: Mapping[str, object], kind: type[TracksMeta] | type[ModelMeta], path: AnyPath) -> None:
     """Check the types of a header's values.
 
     Raises:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass, field
 from enum import IntEnum
 
@@ -10,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jawusd.base.arrays import Array, Mask
-from jawusd.base.errors import FormatError
+from jawusd.base.errors import AnyPath, FormatError
 from jawusd.base.npz import NamedArrays, take
 from jawusd.formats.atomic import write_text_atomic
 
@@ -78,7 +77,7 @@ class Performance:
         return np.sqrt(np.einsum("fii->fi", self.covariance)[:, 6:] + np.einsum("fii->fi", self.rig_covariance))
 
 
-def write_performance(path: str | os.PathLike[str], performance: Performance, fps: float) -> None:
+def write_performance(path: AnyPath, performance: Performance, fps: float) -> None:
     """Write the jaw of every frame as CSV, atomically, with columns `HEADER`; lengths in mm, time 0 at frame 0.
 
     Raises:
@@ -119,7 +118,7 @@ class SolvedJaw:
         return found
 
 
-def take_solved(arrays: NamedArrays, count: int, path: str | os.PathLike[str]) -> SolvedJaw | None:
+def take_solved(arrays: NamedArrays, count: int, path: AnyPath) -> SolvedJaw | None:
     """Return the performance arrays of a tracks file with `count` frames; None if the file has none.
 
     Raises:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import json
-import os
 from dataclasses import asdict, dataclass
 
 from jawusd.base.arrays import Array
+from jawusd.base.errors import AnyPath
 from jawusd.formats.atomic import write_text_atomic
 from jawusd.formats.finding import Finding
 
@@ -71,7 +71,7 @@ class AlignedPhotos:
         }
 
 
-def save_photographs(path: str | os.PathLike[str], photographs: AlignedPhotos) -> None:
+def save_photographs(path: AnyPath, photographs: AlignedPhotos) -> None:
     """Write photos.json atomically.
 
     Raises:

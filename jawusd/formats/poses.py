@@ -15,7 +15,6 @@ of `actor_skel.usdc`). Rotations are given twice: as angles about fixed x, then 
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jawusd.base.arrays import Array
-from jawusd.base.errors import FormatError, errors_name_file
+from jawusd.base.errors import AnyPath, FormatError, errors_name_file
 from jawusd.base.tables import TextTable, is_number, read_table
 from jawusd.formats.atomic import write_text_atomic
 from jawusd.formats.text import read_json
@@ -120,9 +119,7 @@ def _listed(table: TextTable) -> str:
 
 
 @errors_name_file
-def read_poses(
-    path: str | os.PathLike[str], columns: Mapping[str, str] | None = None
-) -> tuple[NDArray[np.int64], Array]:
+def read_poses(path: AnyPath, columns: Mapping[str, str] | None = None) -> tuple[NDArray[np.int64], Array]:
     """Read frame numbers (F,) and T_skull_mandible (F, 4, 4) from CSV or JSON; the last matrix row may be omitted.
 
     `columns` are the file's names of columns that differ from the module's, e.g. {"tx": "X"}; rows are then numbered
@@ -135,7 +132,7 @@ def read_poses(
 
 
 @errors_name_file
-def read_poses_or_parameters(path: str | os.PathLike[str]) -> tuple[NDArray[np.int64], Array]:
+def read_poses_or_parameters(path: AnyPath) -> tuple[NDArray[np.int64], Array]:
     """Read frame numbers (F,), and parameters d [mm] (F, 3) or T_skull_mandible (F, 4, 4), from CSV or JSON.
 
     Raises:
@@ -195,7 +192,7 @@ def _checked_rigid(T: Array, table: TextTable) -> Array:
 
 
 @errors_name_file
-def read_parameters(path: str | os.PathLike[str]) -> tuple[NDArray[np.int64], Array]:
+def read_parameters(path: AnyPath) -> tuple[NDArray[np.int64], Array]:
     """Read frame numbers (F,) and parameters d [mm] (F, 3) from CSV or JSON.
 
     Raises:
@@ -212,7 +209,7 @@ def _parameters_of(table: TextTable) -> tuple[NDArray[np.int64], Array]:
     return frames, _numbers(table, PARAMETER_COLUMNS)
 
 
-def write_poses(path: str | os.PathLike[str], frames: NDArray[np.int64], T: Array) -> None:
+def write_poses(path: AnyPath, frames: NDArray[np.int64], T: Array) -> None:
     """Write T_skull_mandible (F, 4, 4) of frames (F,) as CSV with matrix columns, atomically, in full precision.
 
     Raises:
@@ -221,7 +218,7 @@ def write_poses(path: str | os.PathLike[str], frames: NDArray[np.int64], T: Arra
     write_table(path, ("frame", *MATRIX_COLUMNS), frames, np.asarray(T).reshape(len(frames), 16))
 
 
-def write_parameters(path: str | os.PathLike[str], frames: NDArray[np.int64], d: Array) -> None:
+def write_parameters(path: AnyPath, frames: NDArray[np.int64], d: Array) -> None:
     """Write parameters d [mm] (F, 3) as CSV, atomically, in full precision.
 
     Raises:
@@ -230,9 +227,7 @@ def write_parameters(path: str | os.PathLike[str], frames: NDArray[np.int64], d:
     write_table(path, ("frame", *PARAMETER_COLUMNS), frames, d)
 
 
-def write_table(
-    path: str | os.PathLike[str], header: tuple[str, ...], frames: NDArray[np.int64], values: Array
-) -> None:
+def write_table(path: AnyPath, header: tuple[str, ...], frames: NDArray[np.int64], values: Array) -> None:
     """Write frames (F,) and values (F, len(header) - 1) as CSV, atomically; the first column is the frame.
 
     Raises:
@@ -256,7 +251,7 @@ class JointDelta:
     clamped_mm: float  # distance by which the jaw parameters were clamped to the bound
 
 
-def save_joint_table(path: str | os.PathLike[str], rows: Iterable[JointDelta]) -> None:
+def save_joint_table(path: AnyPath, rows: Iterable[JointDelta]) -> None:
     """Write a joint table atomically.
 
     Raises:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 import tomllib
 from pathlib import Path
@@ -11,7 +10,7 @@ from typing import Annotated, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
-from jawusd.base.errors import FormatError, errors_name_file
+from jawusd.base.errors import AnyPath, FormatError, errors_name_file
 from jawusd.base.tables import read_text
 from jawusd.formats.capture_keys import table_model
 
@@ -35,7 +34,7 @@ T = TypeVar("T")
 Frames = Annotated[int, Field(ge=-10_000_000, le=10_000_000)]
 
 
-def read_toml(path: str | os.PathLike[str]) -> dict[str, object]:
+def read_toml(path: AnyPath) -> dict[str, object]:
     """Return the content of a TOML file.
 
     Raises:
@@ -90,7 +89,7 @@ def read_json(path: Path, most_bytes: int) -> object:
         raise FormatError(f"is not JSON ({error}).") from error
 
 
-def read_model(path: str | os.PathLike[str], most_bytes: int, model: type[Model], hint: str | None = None) -> Model:
+def read_model(path: AnyPath, most_bytes: int, model: type[Model], hint: str | None = None) -> Model:
     """Read a JSON file of at most `most_bytes` as a pydantic model, whose field descriptions are used in messages.
 
     Raises:
@@ -129,7 +128,7 @@ def _fault(error: ValidationError, model: type[BaseModel]) -> str:
     return f"{where}{name} needs {needed}{found}"
 
 
-def of_kind(found: object, kind: type[T], name: str, path: str | os.PathLike[str], hint: str) -> T:
+def of_kind(found: object, kind: type[T], name: str, path: AnyPath, hint: str) -> T:
     """Return a named value of a JSON file, validated against a type.
 
     Raises:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
@@ -13,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jawusd.base.arrays import Array, Mask
-from jawusd.base.errors import FormatError
+from jawusd.base.errors import AnyPath, FormatError
 from jawusd.base.npz import TWIST_ORDER, UNITS, read_npz, take
 from jawusd.formats.atomic import write_npz_atomic
 from jawusd.formats.notes import TracksMeta, check_notes
@@ -156,7 +155,7 @@ def _shapes(count: int, cameras: int) -> dict[str, tuple[int, ...]]:
     }
 
 
-def save_tracks(path: str | os.PathLike[str], tracks: Tracks) -> None:
+def save_tracks(path: AnyPath, tracks: Tracks) -> None:
     """Write tracks atomically as `.npz`.
 
     Raises:
@@ -182,7 +181,7 @@ def save_tracks(path: str | os.PathLike[str], tracks: Tracks) -> None:
     write_npz_atomic(path, {**arrays, "meta": np.array(json.dumps(meta, sort_keys=True))})
 
 
-def load_tracks(path: str | os.PathLike[str]) -> Tracks:
+def load_tracks(path: AnyPath) -> Tracks:
     """Read tracks of format jawusd-tracks/1 and check them.
 
     Raises:

@@ -10,7 +10,7 @@ import av
 import numpy as np
 from numpy.typing import NDArray
 
-from jawusd.base.errors import CaptureError
+from jawusd.base.errors import AnyPath, CaptureError
 from jawusd.base.inputs import check_input
 
 #: Maximum number of pixels of an image, four times 8K; a small header can declare an image that exhausts memory.
@@ -39,7 +39,7 @@ _NAMES = ("h264", "hevc", "prores", "dnxhd", "ffv1", "vp9", "av1", "mjpeg", "png
 
 
 def open_container(
-    path: str | os.PathLike[str], formats: tuple[str, ...] = FORMATS, most_px: int = MOST_PX
+    path: AnyPath, formats: tuple[str, ...] = FORMATS, most_px: int = MOST_PX
 ) -> av.container.InputContainer:
     """Open a video or audio file, or a file in one of the given formats.
 
@@ -98,7 +98,7 @@ class Sound(NamedTuple):
     start_s: float  # presentation time of the first sample
 
 
-def read_sound(path: str | os.PathLike[str], rate_hz: int) -> Sound | None:
+def read_sound(path: AnyPath, rate_hz: int) -> Sound | None:
     """Return the first sound track of a file, or None if there is none.
 
     Raises:

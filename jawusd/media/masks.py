@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import os
 from collections import deque
 from collections.abc import Callable, Generator, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -11,7 +10,7 @@ from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
 
-from jawusd.base.errors import CaptureError
+from jawusd.base.errors import AnyPath, CaptureError
 from jawusd.formats.capture import CameraSource
 from jawusd.formats.clips import ClipSource
 from jawusd.formats.file_names import is_pattern, numbered_files
@@ -48,7 +47,7 @@ class MaskReader:
 
     def __init__(
         self,
-        path: str | os.PathLike[str] | OneMask,
+        path: AnyPath | OneMask,
         size_px: tuple[int, int],
         *,
         timeline: Timeline | None = None,
@@ -249,7 +248,7 @@ def _timeline(clip: ClipSource, changed_ns: int) -> Timeline:
     return open_clip(clip).timeline
 
 
-def mask_size_px(path: str | os.PathLike[str]) -> tuple[int, int]:
+def mask_size_px(path: AnyPath) -> tuple[int, int]:
     """Return the (width, height) of the first mask in a PNG pattern or a video.
 
     Raises:

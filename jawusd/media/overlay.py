@@ -7,7 +7,6 @@ as colours, from the occlusal side, front, left and right.
 from __future__ import annotations
 
 import math
-import os
 import threading
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -18,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jawusd.base.arrays import Array
-from jawusd.base.errors import CaptureError
+from jawusd.base.errors import AnyPath, CaptureError
 from jawusd.formats.atomic import write_bytes_atomic
 from jawusd.formats.capture import CameraSource
 from jawusd.formats.mesh import BASE, GUM, TOOTH, Mesh, crown_face_mask
@@ -141,7 +140,7 @@ def contact_sheet(tiles: Sequence[NDArray[np.uint8]], columns: int) -> NDArray[n
     return sheet
 
 
-def save_png(path: str | os.PathLike[str], image: NDArray[np.uint8]) -> None:
+def save_png(path: AnyPath, image: NDArray[np.uint8]) -> None:
     """Write an RGB image (h, w, 3) as PNG.
 
     Raises:

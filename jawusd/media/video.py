@@ -8,7 +8,6 @@ identified by its time stamp, so that B-frames, edit lists and variable rates ca
 from __future__ import annotations
 
 import contextlib
-import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -16,7 +15,7 @@ import av
 import numpy as np
 from numpy.typing import NDArray
 
-from jawusd.base.errors import CaptureError, naming_file
+from jawusd.base.errors import AnyPath, CaptureError, naming_file
 from jawusd.base.inputs import check_input, why_unreadable
 from jawusd.formats.clips import timecode_rates
 from jawusd.media.clip import Clip, Timeline, VideoFrame
@@ -48,7 +47,7 @@ class Video(Clip):
 
     def __init__(
         self,
-        path: str | os.PathLike[str],
+        path: AnyPath,
         colour_space: str | None = None,
         colour_config: Path | None = None,
     ) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import os
 from fractions import Fraction
 from types import TracebackType
 
@@ -12,6 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from jawusd.base.errors import AnyPath
 from jawusd.formats.atomic import atomic_path, write_bytes_atomic
 from jawusd.geometry import Camera
 from jawusd.media.working_view import WorkingView
@@ -24,7 +24,7 @@ class VideoWriter:
 
     def __init__(
         self,
-        path: str | os.PathLike[str],
+        path: AnyPath,
         size_px: tuple[int, int],
         fps: float,
         *,
@@ -103,7 +103,7 @@ class PlateWriter:
     def __init__(self, camera: Camera) -> None:
         self._view = WorkingView(camera, camera.size_px)
 
-    def write(self, path: str | os.PathLike[str], image: NDArray[np.uint8]) -> None:
+    def write(self, path: AnyPath, image: NDArray[np.uint8]) -> None:
         """Undistort and write a recorded image (h, w, 3) RGB.
 
         Raises:
@@ -112,7 +112,7 @@ class PlateWriter:
         plate = self._view.picture(image)[..., ::-1]
         write_bytes_atomic(path, cv2.imencode(".jpg", plate, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1].tobytes())
 
-    def write_light(self, path: str | os.PathLike[str], image: NDArray[np.float32]) -> None:
+    def write_light(self, path: AnyPath, image: NDArray[np.float32]) -> None:
         """Undistort a linear-light RGB image (h, w, 3) and write it as a ZIP-compressed EXR of half floats.
 
         Raises:

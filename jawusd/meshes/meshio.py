@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal, NamedTuple
@@ -13,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jawusd.base.arrays import Array
-from jawusd.base.errors import CaptureError, errors_name_file, explain_missing_packages
+from jawusd.base.errors import AnyPath, CaptureError, errors_name_file, explain_missing_packages
 from jawusd.base.inputs import check_input, why_unreadable
 from jawusd.formats.file_names import MESHES
 from jawusd.formats.mesh import Mesh, tooth_labels, without_loose
@@ -33,7 +32,7 @@ _UNITS_MM = {"metres": 1000.0, "centimetres": 10.0, "inches": 25.4, "micrometres
 
 @errors_name_file
 @np.errstate(invalid="ignore", over="ignore")  # non-finite vertices are reported later, if a face uses them
-def load_mesh(path: str | os.PathLike[str], kind: Literal["scan", "bone"] = "scan") -> Mesh:
+def load_mesh(path: AnyPath, kind: Literal["scan", "bone"] = "scan") -> Mesh:
     """Read a triangle mesh [mm] from PLY, STL, OBJ or 3Shape DCM; vertices keep the order of the file.
 
     Polygons are triangulated; STL files give three vertices per triangle. Texture coordinates are read from OBJ and
