@@ -10,12 +10,13 @@ from pydantic import Field, ValidationError, field_validator, model_validator
 
 from jawusd.base.errors import AnyPath, FormatError, JawusdError, UnitsError
 from jawusd.base.npz import check_format
-from jawusd.formats.capture_keys import Key, KeyEntry, entries, problems_of
+from jawusd.formats.capture_keys import Key, KeyEntry, entries, key, optional, problems_of
 from jawusd.formats.capture_parts import Boards, CameraSource, Scans, resolve_paths, similar_names
 from jawusd.formats.text import Strict, read_toml
 from jawusd.geometry import rigidity_defect
 
 FAMILY, VERSION = "jawusd-capture", 1
+_FrameNumber = Annotated[int, Field(ge=0)]
 _MOST_PICKS = 200  # maximum number of picked vertices per arch; tracking tries all triples of them
 
 
@@ -27,85 +28,66 @@ class Sync(Strict):
     camera: frame k of the camera is simultaneous with frame k + offset of the reference camera.
     """
 
-    method: Annotated[
-        Literal["flash", "audio", "timecode", "numbers", "offsets"],
-        Key(
-            '"flash": light flashes, or sound if there are none; "audio": sound only; "timecode": time codes of the '
-            'clips; "numbers": frame numbers of image sequences; "offsets": as given.'
-        ),
-    ] = "flash"
-    reference: Annotated[
-        str | None, Key("Reference camera, whose frames are counted; default: the first.", '"left"')
-    ] = None
-    offsets: Annotated[
-        dict[str, int] | None,
-        Key(
-            "Per camera: its frame k is simultaneous with frame k + offset of the reference camera.",
-            "{ left = 0, right = 5 }",
-            "frames",
-        ),
-    ] = None
+    method: Literal["flash", "audio", "timecode", "numbers", "offsets"] = key(
+        '"flash": light flashes, or sound if there are none; "audio": sound only; "timecode": time codes of the '
+        'clips; "numbers": frame numbers of image sequences; "offsets": as given.',
+        default="flash",
+    )
+    reference: str | None = optional("Reference camera, whose frames are counted; default: the first.", '"left"')
+    offsets: dict[str, int] | None = optional(
+        "Per camera: its frame k is simultaneous with frame k + offset of the reference camera.",
+        "{ left = 0, right = 5 }",
+        "frames",
+    )
 
 
 class PickView(Strict):
     """Pixel of a picked vertex in the recorded image of one camera (OpenCV coordinates)."""
 
-    camera: Annotated[str, Key("Name of the camera.", '"left"')]
-    x: Annotated[float, Key("Pixel column; the centre of the first pixel is 0.", "651.5", "px")]
-    y: Annotated[float, Key("Pixel row.", "250.4", "px")]
+    camera: str = key("Name of the camera.", '"left"')
+    x: float = key("Pixel column; the centre of the first pixel is 0.", "651.5", "px")
+    y: float = key("Pixel row.", "250.4", "px")
 
 
 class Pick(Strict):
     """Picked vertex of a teeth scan, and its pixels in the images of several cameras."""
 
-    vertex: Annotated[
-        int,
-        Field(ge=0),
-        Key("Index of a vertex of the scan, from 0 in file order; `jawusd view` writes it.", "0"),
-    ]
-    views: Annotated[
-        tuple[PickView, ...],
-        Field(min_length=2),
-        Key(
-            "Where it is seen, in two or more cameras.",
-            '[{ camera = "left", x = 651.5, y = 250.4 }, { camera = "right", x = 663.2, y = 290.4 }]',
-            "px",
-        ),
-    ]
+    vertex: int = key("Index of a vertex of the scan, from 0 in file order; `jawusd view` writes it.", "0", ge=0)
+    views: tuple[PickView, ...] = key(
+        "Where it is seen, in two or more cameras.",
+        '[{ camera = "left", x = 651.5, y = 250.4 }, { camera = "right", x = 663.2, y = 290.4 }]',
+        "px",
+        min_length=2,
+    )
 
 
 class Bootstrap(Strict):
     """Picked vertices that initialise tracking, in one frame of the reference camera."""
 
-    frame: Annotated[int, Field(ge=0), Key("Frame of the reference camera in which the points are picked.", "120")]
-    upper: Annotated[tuple[Pick, ...], Field(max_length=_MOST_PICKS)] = ()
-    lower: Annotated[tuple[Pick, ...], Field(max_length=_MOST_PICKS)] = ()
+    frame: int = key("Frame of the reference camera in which the points are picked.", "120", ge=0)
+    upper: tuple[Pick, ...] = Field((), max_length=_MOST_PICKS)
+    lower: tuple[Pick, ...] = Field((), max_length=_MOST_PICKS)
 
 
 class MotionSection(Strict):
     """Rest frame: the video frame in which the teeth are in occlusion."""
 
-    rest_frame: Annotated[
-        Annotated[int, Field(ge=0)] | None,
-        Key("A frame with the teeth together; default: frames in occlusion are found automatically.", "46"),
-    ] = None
+    rest_frame: int | None = optional(
+        "A frame with the teeth together; default: frames in occlusion are found automatically.", "46", ge=0
+    )
 
 
 class AnatomySection(Strict):
     """Values that replace those derived from the scans."""
 
-    T_anatomical_skull: Annotated[
-        list[list[float]] | None,
-        Key("4 x 4 matrix from the scans' frame to the anatomical one (x left, y up, z forward).", unit="mm"),
-    ] = None
-    landmarks: Annotated[
-        dict[str, tuple[float, float, float]] | None,
-        Key(
-            "Points of mandible and ears (tragion_left, tragion_right) in the scans' frame, by name.",
-            "{ lower_incisor = [0.0, -1.0, 2.0] }",
-            "mm",
-        ),
-    ] = None
+    T_anatomical_skull: list[list[float]] | None = optional(
+        "4 x 4 matrix from the scans' frame to the anatomical one (x left, y up, z forward).", unit="mm"
+    )
+    landmarks: dict[str, tuple[float, float, float]] | None = optional(
+        "Points of mandible and ears (tragion_left, tragion_right) in the scans' frame, by name.",
+        "{ lower_incisor = [0.0, -1.0, 2.0] }",
+        "mm",
+    )
 
     @field_validator("T_anatomical_skull")
     @classmethod
@@ -121,30 +103,27 @@ class Capture(Strict):
     """Content of a capture.toml; paths are absolute after loading."""
 
     folder: Path
-    name: Annotated[
-        str,
-        Field(min_length=1, pattern=r"^[A-Za-z0-9_\-. ]+$"),
-        Key("Name of the subject or take: letters, digits, spaces, _ - and dots.", '"anna"'),
-    ]
-    fps: Annotated[float, Field(gt=0, le=10000), Key("Frame rate of the clips.", "23.976", "frames per second")]
-    frames: Annotated[
-        tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)]] | None,
-        Key("First frame, and one past the last, of the reference camera; default: all.", "[30, 270]", "frames"),
-    ] = None
-    calibration: Annotated[
-        Path | None,
-        Key("Calibration of the cameras; default: calibrated from [boards].", '"calibration.toml"'),
-    ] = None
-    calibration_unit_mm: Annotated[
-        float,
-        Field(gt=0, le=1e6),
-        Key("Length of the calibration's unit: 1000 if it is in metres.", "1000.0", "mm"),
-    ] = 1.0
-    colour_config: Annotated[
-        Path | None, Key("OpenColorIO config that defines named colour spaces of the footage.", '"config.ocio"')
-    ] = None
+    name: str = key(
+        "Name of the subject or take: letters, digits, spaces, _ - and dots.",
+        '"anna"',
+        min_length=1,
+        pattern=r"^[A-Za-z0-9_\-. ]+$",
+    )
+    fps: float = key("Frame rate of the clips.", "23.976", "frames per second", gt=0, le=10000)
+    frames: tuple[_FrameNumber, _FrameNumber] | None = optional(
+        "First frame, and one past the last, of the reference camera; default: all.", "[30, 270]", "frames"
+    )
+    calibration: Path | None = optional(
+        "Calibration of the cameras; default: calibrated from [boards].", '"calibration.toml"'
+    )
+    calibration_unit_mm: float = key(
+        "Length of the calibration's unit: 1000 if it is in metres.", "1000.0", "mm", default=1.0, gt=0, le=1e6
+    )
+    colour_config: Path | None = optional(
+        "OpenColorIO config that defines named colour spaces of the footage.", '"config.ocio"'
+    )
     scans: Scans
-    cameras: Annotated[tuple[CameraSource, ...], Field(min_length=1, max_length=64, alias="camera")]
+    cameras: tuple[CameraSource, ...] = Field(min_length=1, max_length=64, alias="camera")
     boards: Boards | None = None
     sync: Sync = Sync()
     bootstrap: Bootstrap | None = None
@@ -155,7 +134,7 @@ class Capture(Strict):
     def _consistent(self) -> Capture:
         own = {"fps": self.fps, "colour_config": self.colour_config}
         cameras = tuple(
-            camera.model_copy(update={key: value for key, value in own.items() if getattr(camera, key) is None})
+            camera.model_copy(update={name: value for name, value in own.items() if getattr(camera, name) is None})
             for camera in self.cameras
         )
         object.__setattr__(self, "cameras", cameras)  # a frozen model rejects plain assignment
@@ -188,11 +167,11 @@ class Capture(Strict):
             for row in ("upper", "lower"):
                 picks = getattr(self.bootstrap, row)
                 mentioned[f"[[bootstrap.{row}]] camera"] = [view.camera for pick in picks for view in pick.views]
-        for key, found in mentioned.items():
+        for place, found in mentioned.items():
             unknown = [name for name in found if name not in names]
             if unknown:
                 raise ValueError(
-                    f'{key} names camera "{unknown[0]}"; cameras are {listed}. Use the name from its [[camera]] table'
+                    f'{place} names camera "{unknown[0]}"; cameras are {listed}. Use the name from its [[camera]] table'
                 )
         missing = [name for name in names if self.sync.offsets is not None and name not in self.sync.offsets]
         if missing:

@@ -5,18 +5,19 @@ from __future__ import annotations
 import difflib
 import json
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import NoneType, UnionType
-from typing import Annotated, Literal, Union, get_args, get_origin
+from typing import Annotated, Literal, TypeVar, Union, cast, get_args, get_origin
 
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel, Field, ValidationError
 from pydantic.fields import FieldInfo
 
 _CLOSE = 0.6  # minimum difflib ratio of a misspelt and a suggested key; 0.89 for "mask" and "masks"
 _ALLOWED_SHOWN = 300  # maximum length of a list of keys in a message [characters]
 
+T = TypeVar("T")
 Location = tuple[int | str, ...]
 #: Messages by pydantic's error type; names in braces are keys of the error's context.
 _WORDS = {
@@ -45,11 +46,22 @@ _NEEDED = (
 
 @dataclass(frozen=True)
 class Key:
-    """Documentation of one key, stored in the annotation of the model field."""
+    """Documentation of one key."""
 
     meaning: str
     example: str = ""  # example value as written in the file
     unit: str = ""
+
+
+def key(meaning: str, example: str = "", unit: str = "", **limits: object) -> T:  # type: ignore[type-var]  # as Field
+    """Return a model field with its documentation (see `Key`), and pydantic's limits and default."""
+    make = cast("Callable[..., T]", Field)  # type: ignore[explicit-any]  # limits have several types
+    return make(description=meaning, json_schema_extra={"example": example, "unit": unit}, **limits)
+
+
+def optional(meaning: str, example: str = "", unit: str = "", **limits: object) -> T | None:
+    """Return a model field like `key`, with the default None."""
+    return key(meaning, example, unit, default=None, **limits)
 
 
 @dataclass(frozen=True)
@@ -64,8 +76,9 @@ class KeyEntry:
 
 
 def describe_key(field: FieldInfo) -> Key:
-    """Return the documentation in a field's annotation."""
-    return next((item for item in field.metadata if isinstance(item, Key)), Key(""))
+    """Return the documentation of a field made by `key`."""
+    documented = field.json_schema_extra if isinstance(field.json_schema_extra, dict) else {}
+    return Key(field.description or "", *(str(documented.get(name, "")) for name in ("example", "unit")))
 
 
 def entries(

@@ -7,12 +7,12 @@ import os
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Literal, TypeVar
+from typing import Literal, TypeVar
 
-from pydantic import BaseModel, Field, model_validator
+from pydantic import BaseModel, model_validator
 
 from jawusd.base.errors import CaptureError, JawusdError
-from jawusd.formats.capture_keys import Key, Location, place
+from jawusd.formats.capture_keys import Location, key, optional, place
 from jawusd.formats.clips import ClipSource
 from jawusd.formats.file_names import is_pattern, wrong_kind
 from jawusd.formats.text import Strict
@@ -21,22 +21,21 @@ from jawusd.formats.text import Strict
 class Scans(Strict):
     """The meshes, in a common frame with the teeth in occlusion [mm]."""
 
-    upper_teeth: Annotated[
-        Path, Key("Scan of the upper teeth: PLY, STL, OBJ or (with jawusd[dcm]) 3Shape DCM.", '"scans/upper.ply"', "mm")
-    ]
-    lower_teeth: Annotated[
-        Path,
-        Key("Scan of the lower teeth, in the frame of the upper one, teeth in occlusion.", '"scans/lower.ply"', "mm"),
-    ]
-    mandible: Annotated[
-        Path | None, Key("Mesh of the whole mandible, same frame; default: a placeholder.", '"mandible.ply"', "mm")
-    ] = None
-    skull: Annotated[Path | None, Key("Mesh of the skull, same frame.", '"scans/skull.ply"', "mm")] = None
-    labels: Annotated[Path | None, Key("Folder of crown and gum labels; default: beside the scans.", '"labels"')] = None
-    registration: Annotated[
-        Literal["scan", "take"],
-        Key('"scan": keep both scans as given; "take": move the lower scan to the closed bite found in the take.'),
-    ] = "scan"
+    upper_teeth: Path = key(
+        "Scan of the upper teeth: PLY, STL, OBJ or (with jawusd[dcm]) 3Shape DCM.", '"scans/upper.ply"', "mm"
+    )
+    lower_teeth: Path = key(
+        "Scan of the lower teeth, in the frame of the upper one, teeth in occlusion.", '"scans/lower.ply"', "mm"
+    )
+    mandible: Path | None = optional(
+        "Mesh of the whole mandible, same frame; default: a placeholder.", '"mandible.ply"', "mm"
+    )
+    skull: Path | None = optional("Mesh of the skull, same frame.", '"scans/skull.ply"', "mm")
+    labels: Path | None = optional("Folder of crown and gum labels; default: beside the scans.", '"labels"')
+    registration: Literal["scan", "take"] = key(
+        '"scan": keep both scans as given; "take": move the lower scan to the closed bite found in the take.',
+        default="scan",
+    )
 
 
 class Masks(Strict):
@@ -47,18 +46,12 @@ class Masks(Strict):
     0 neither.
     """
 
-    upper: Annotated[
-        Path,
-        Key("Masks of the upper teeth: PNG files numbered as %06d, or a video.", '"masks/left/upper/%06d.png"'),
-    ]
-    lower: Annotated[Path, Key("Masks of the lower teeth.", '"masks/left/lower/%06d.png"')]
-    upper_value: Annotated[
-        Annotated[int, Field(ge=1, le=65535)] | None,
-        Key("With `labels`: gray value of the upper teeth.", "1"),
-    ] = None
-    lower_value: Annotated[
-        Annotated[int, Field(ge=1, le=65535)] | None, Key("With `labels`: gray value of the lower teeth.", "2")
-    ] = None
+    upper: Path = key(
+        "Masks of the upper teeth: PNG files numbered as %06d, or a video.", '"masks/left/upper/%06d.png"'
+    )
+    lower: Path = key("Masks of the lower teeth.", '"masks/left/lower/%06d.png"')
+    upper_value: int | None = optional("With `labels`: gray value of the upper teeth.", "1", ge=1, le=65535)
+    lower_value: int | None = optional("With `labels`: gray value of the lower teeth.", "2", ge=1, le=65535)
 
     @model_validator(mode="before")
     @classmethod
@@ -106,54 +99,43 @@ class Masks(Strict):
 class CameraSource(Strict):
     """The footage and masks of one camera."""
 
-    name: Annotated[
-        str,
-        Field(min_length=1, pattern=r"^[A-Za-z0-9_\-]+$"),
-        Key("Name of the camera, as in the calibration: letters, digits, _ and -.", '"left"'),
-    ]
-    video: Annotated[
-        Path | None,
-        Key(
-            "Footage of the camera: a video, or an image sequence (PNG, TIFF, EXR, DPX, JPEG) such as left.%04d.exr, "
-            "left.####.exr or left.*.exr.",
-            '"left.mp4"',
-        ),
-    ] = None
+    name: str = key(
+        "Name of the camera, as in the calibration: letters, digits, _ and -.",
+        '"left"',
+        min_length=1,
+        pattern=r"^[A-Za-z0-9_\-]+$",
+    )
+    video: Path | None = optional(
+        "Footage of the camera: a video, or an image sequence (PNG, TIFF, EXR, DPX, JPEG) such as left.%04d.exr, "
+        "left.####.exr or left.*.exr.",
+        '"left.mp4"',
+    )
     masks: Masks | None = None
-    timecode: Annotated[
-        str,
-        Key(
-            'Time code of the first frame, if the file has none; ";" before the frames for drop-frame counting.',
-            '"10:24:03:12"',
-        ),
-    ] = ""
-    start_frame: Annotated[
-        Annotated[int, Field(ge=0)] | None,
-        Key('Number of the first frame for [sync] method = "numbers"; default: from the file name.', "1001"),
-    ] = None
-    fps: Annotated[
-        Annotated[float, Field(gt=0, le=10000)] | None,
-        Key("Frame rate of an image sequence; default: that of the capture.", "23.976", "frames per second"),
-    ] = None
-    colour_space: Annotated[
-        str | None,
-        Key(
-            '"display", "linear" or "cineon", or a name in the OpenColorIO config; default: by file type (EXR: linear, '
-            "others: display).",
-            '"linear"',
-        ),
-    ] = None
-    colour_config: Annotated[
-        Path | None, Key("OpenColorIO config of this camera; default: that of the capture.", '"config.ocio"')
-    ] = None
-    pixel_aspect: Annotated[
-        Annotated[float, Field(ge=0.1, le=10)] | None,
-        Key(
-            "Pixel aspect ratio, width over height; default: from the file. Used with calibrations of desqueezed "
-            "images.",
-            "2.0",
-        ),
-    ] = None
+    timecode: str = key(
+        'Time code of the first frame, if the file has none; ";" before the frames for drop-frame counting.',
+        '"10:24:03:12"',
+        default="",
+    )
+    start_frame: int | None = optional(
+        'Number of the first frame for [sync] method = "numbers"; default: from the file name.', "1001", ge=0
+    )
+    fps: float | None = optional(
+        "Frame rate of an image sequence; default: that of the capture.", "23.976", "frames per second", gt=0, le=10000
+    )
+    colour_space: str | None = optional(
+        '"display", "linear" or "cineon", or a name in the OpenColorIO config; default: by file type (EXR: linear, '
+        "others: display).",
+        '"linear"',
+    )
+    colour_config: Path | None = optional(
+        "OpenColorIO config of this camera; default: that of the capture.", '"config.ocio"'
+    )
+    pixel_aspect: float | None = optional(
+        "Pixel aspect ratio, width over height; default: from the file. Used with calibrations of desqueezed images.",
+        "2.0",
+        ge=0.1,
+        le=10,
+    )
 
     @model_validator(mode="after")
     def _has_source(self) -> CameraSource:
@@ -176,28 +158,20 @@ class Boards(Strict):
     as simultaneous. A ChArUco board also needs OpenCV's name of its marker dictionary, and the marker size.
     """
 
-    pattern: Annotated[Literal["chessboard", "charuco"], Key("Type of board.")] = "chessboard"
-    cols: Annotated[
-        int, Field(ge=3, le=50), Key("Inner corners along a row: number of squares less one. 3 to 50.", "9", "corners")
-    ]
-    rows: Annotated[int, Field(ge=3, le=50), Key("Inner corners along a column.", "6", "corners")]
-    square_mm: Annotated[
-        float, Field(gt=0, le=200), Key("Side of a square, measured on the printed board. Up to 200.", "8.0", "mm")
-    ]
-    videos: Annotated[
-        tuple[Path, ...],
-        Key(
-            "Clip of the board per camera, in the order of the cameras: videos, or image sequences as %04d.",
-            '["board_left.mp4", "board_right.mp4"]',
-        ),
-    ]
-    dictionary: Annotated[
-        Annotated[str, Field(pattern=r"^DICT_[4-7]X[4-7]_(50|100|250|1000)$")] | None,
-        Key("ChArUco boards: OpenCV's name of the marker dictionary.", '"DICT_5X5_100"'),
-    ] = None
-    marker_mm: Annotated[
-        Annotated[float, Field(gt=0, le=200)] | None, Key("ChArUco boards: side of a marker.", "6.0", "mm")
-    ] = None
+    pattern: Literal["chessboard", "charuco"] = key("Type of board.", default="chessboard")
+    cols: int = key("Inner corners along a row: number of squares less one. 3 to 50.", "9", "corners", ge=3, le=50)
+    rows: int = key("Inner corners along a column.", "6", "corners", ge=3, le=50)
+    square_mm: float = key("Side of a square, measured on the printed board. Up to 200.", "8.0", "mm", gt=0, le=200)
+    videos: tuple[Path, ...] = key(
+        "Clip of the board per camera, in the order of the cameras: videos, or image sequences as %04d.",
+        '["board_left.mp4", "board_right.mp4"]',
+    )
+    dictionary: str | None = optional(
+        "ChArUco boards: OpenCV's name of the marker dictionary.",
+        '"DICT_5X5_100"',
+        pattern=r"^DICT_[4-7]X[4-7]_(50|100|250|1000)$",
+    )
+    marker_mm: float | None = optional("ChArUco boards: side of a marker.", "6.0", "mm", gt=0, le=200)
 
     @model_validator(mode="after")
     def _describes_markers(self) -> Boards:
