@@ -52,15 +52,15 @@ def judge_jaw_track(
             f'the alignment is of "{alignment.actor}", but the rig is of "{rig.actor}".',
             hint="Run `jawusd align` with this rig.",
         )
-    track = read_jaw_track(path, alignment.joint)
-    T = track.poses(alignment, rig.T_rest)
+    frames, motion = read_jaw_track(path, alignment.joint)
+    T = alignment.jaw_poses(motion, rig.T_rest)
     error = alignment_error_mm(rig, T, alignment)
     widened = _WIDENED * float(np.median(error)) if len(error) else 0.0
     limits = rig.limits.replaced(residual_mm, tolerance_mm, None)
     verdicts = rig.validate(
         T, residual_limit_mm=limits.residual_mm + widened, tolerance_mm=limits.tolerance_mm + widened
     )
-    return JudgedFace(track.frames, verdicts, error, widened)
+    return JudgedFace(frames, verdicts, error, widened)
 
 
 def alignment_error_mm(rig: JawRig, T_skull_mandible: Array, alignment: Alignment) -> Array:

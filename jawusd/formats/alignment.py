@@ -33,7 +33,6 @@ The identity is the closed mouth with the teeth in occlusion. Other arrays are i
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -109,6 +108,16 @@ class Alignment(Strict):
         squared: Array = np.einsum("nij,jk,nik->n", J, np.array(self.covariance), J)
         return np.sqrt(squared)
 
+    def jaw_poses(self, T_model_jaw: Array, T_rest: Array) -> Array:
+        """Return T_skull_mandible (F, 4, 4) [mm] of motions of the model's jaw; T_rest (4, 4) is the closed bite.
+
+        With S = `T_skull_model`, ``T_skull_mandible = S T_model_jaw S^-1 T_rest``.
+        """
+        motion = T_model_jaw.copy()
+        motion[:, :3, 3] *= self.unit_mm
+        poses: Array = self.matrix @ motion @ se3_inverse(self.matrix) @ T_rest
+        return poses
+
 
 def motion_of_points(points: Array) -> Array:
     """Return J (..., 3, 7) [mm] of points (..., 3): their motion under a small (omega [rad], v [mm], log scale)."""
@@ -151,26 +160,10 @@ def save_alignment(path: AnyPath, alignment: Alignment) -> None:
 _JOINT_HINT = 'Store it as "joint" in the npz file, or state it in the correspondences of `jawusd align`.'
 
 
-@dataclass(frozen=True, eq=False)
-class JawTrack:
-    """The jaw motion of a face model."""
+def read_jaw_track(path: AnyPath, joint: tuple[float, float, float] | None) -> tuple[Array, Array]:
+    """Read frame numbers (F,) and T_model_jaw (F, 4, 4) of a face model, translations in model units.
 
-    frames: Array  # frame numbers (F,)
-    T_model_jaw: Array  # motions of the jaw in the model's frame, translations in model units, shape (F, 4, 4)
-
-    def poses(self, alignment: Alignment, T_rest: Array) -> Array:
-        """Return T_skull_mandible (F, 4, 4) [mm], given the pose of the closed bite (4, 4).
-
-        With S = `T_skull_model`, ``T_skull_mandible = S T_model_jaw S^-1 T_rest``.
-        """
-        motion = self.T_model_jaw.copy()
-        motion[:, :3, 3] *= alignment.unit_mm
-        poses: Array = alignment.matrix @ motion @ se3_inverse(alignment.matrix) @ T_rest
-        return poses
-
-
-def read_jaw_track(path: AnyPath, joint: tuple[float, float, float] | None) -> JawTrack:
-    """Read the jaw motion of a face model; `joint` [model units] is used if the file does not contain it.
+    `joint` [model units] is used if the file does not contain it.
 
     Raises:
         FormatError: the file has no jaw motion, an array has a wrong shape, or there is no joint.
@@ -178,7 +171,7 @@ def read_jaw_track(path: AnyPath, joint: tuple[float, float, float] | None) -> J
     path = Path(path)
     if path.suffix.lower() != ".npz":
         numbers, T = read_poses(path)
-        return JawTrack(numbers.astype(np.float64), T)
+        return numbers.astype(np.float64), T
     arrays = read_arrays(path)
     if "T_model_jaw" in arrays:
         T = take(arrays, "T_model_jaw", (None, 4, 4), path).astype(np.float64)
@@ -188,7 +181,7 @@ def read_jaw_track(path: AnyPath, joint: tuple[float, float, float] | None) -> J
         raise FormatError('has neither "jaw_pose" nor "T_model_jaw".', path=path)
     count = np.arange(len(T), dtype=np.float64)
     frames = take(arrays, "frames", (len(T),), path).astype(np.float64) if "frames" in arrays else count
-    return JawTrack(frames, T)
+    return frames, T
 
 
 def _turned(arrays: dict[str, Array], joint: tuple[float, float, float] | None, path: Path) -> Array:

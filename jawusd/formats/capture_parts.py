@@ -7,7 +7,7 @@ import os
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Literal, TypeVar
+from typing import Literal, TypeVar, cast
 
 from pydantic import BaseModel, model_validator
 
@@ -203,9 +203,6 @@ def resolve_paths(
     """Return a model with absolute paths, and an error for each path that is missing or outside the folder of `source`.
 
     `data` is the content of the file, for the names of tables in messages.
-
-    Raises:
-        TypeError: the argument is not a model.
     """
     folder = source.resolve().parent
     problems: list[JawusdError] = []
@@ -227,18 +224,14 @@ def resolve_paths(
 
     def walk(value: object, location: Location) -> object:
         if isinstance(value, BaseModel):
-            changed = {}
-            for name, field in type(value).model_fields.items():
-                changed[name] = walk(getattr(value, name), (*location, field.alias or name))
+            fields = type(value).model_fields.items()
+            changed = {name: walk(getattr(value, name), (*location, field.alias or name)) for name, field in fields}
             return value.model_copy(update=changed)
         if isinstance(value, tuple):
             return tuple(walk(item, (*location, i)) for i, item in enumerate(value))
         return absolute(value, location) if isinstance(value, Path) and location != ("folder",) else value
 
-    resolved = walk(model, ())
-    if not isinstance(resolved, type(model)):
-        raise TypeError("only pydantic models can be resolved")
-    return resolved, problems
+    return cast(M, walk(model, ())), problems
 
 
 def _where(location: Location, data: Mapping[str, object]) -> str:

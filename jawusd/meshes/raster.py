@@ -257,14 +257,9 @@ def _popcount(x: np.uint64) -> np.uint64:
     return (x * np.uint64(0x0101010101010101)) >> np.uint64(56)
 
 
-@numba.njit(_INT(_BITS), nogil=True, cache=True)
-def count_bits(bits: Bits) -> np.int64:
+def count_bits(bits: Bits) -> int:
     """Count the set pixels of a (h, words) uint64 bit-row image."""
-    total = np.uint64(0)
-    for y in range(bits.shape[0]):
-        for k in range(bits.shape[1]):
-            total += _popcount(bits[y, k])
-    return np.int64(total)
+    return int(np.bitwise_count(bits).sum())
 
 
 @numba.njit(_INT(_BITS, _BITS), nogil=True, cache=True)

@@ -90,10 +90,10 @@ def test_tracks_are_read_and_others_refused(faces, tmp_path):
     face, path = faces[0], tmp_path / "jaw.npz"
     T = face.motions(face.true[:5])
     np.savez(path, T_model_jaw=T, frames=[3, 4, 5, 6, 9])
-    track = read_jaw_track(path, None)
-    assert track.frames.tolist() == [3, 4, 5, 6, 9] and np.array_equal(track.T_model_jaw, T)
+    frames, motion = read_jaw_track(path, None)
+    assert frames.tolist() == [3, 4, 5, 6, 9] and np.array_equal(motion, T)
     np.savez(path, jaw_pose=so3_log(T[:, :3, :3])[:, None])
-    found = read_jaw_track(path, tuple(face.joint)).T_model_jaw
+    _, found = read_jaw_track(path, tuple(face.joint))
     np.testing.assert_allclose(found[:, :3, :3], so3_exp(so3_log(T[:, :3, :3])), atol=1e-12)
     np.testing.assert_allclose(transform_points(found, face.joint[None])[:, 0], np.tile(face.joint, (5, 1)), atol=1e-12)
     with pytest.raises(FormatError, match='no "joint"'):
