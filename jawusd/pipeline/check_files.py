@@ -23,8 +23,8 @@ from jawusd.pipeline.cameras import load_cameras, rescaled_cameras
 from jawusd.pipeline.subject import BONES, MESHES, TEETH, label_teeth, subject_of_capture
 
 if TYPE_CHECKING:
+    from jawusd.media.checks import MaskSamples
     from jawusd.media.clip import Clip
-    from jawusd.media.mask_survey import MaskSamples
     from jawusd.tracking.contour.scan import Scan
 
 
@@ -169,7 +169,7 @@ def bone_findings(parts: Parts) -> Iterator[Finding]:
 
 def clips(parts: Parts) -> Iterator[Finding]:
     """Open and decode every clip; long clips are decoded only in parts."""
-    from jawusd.media.clip_checks import decoded_findings, rate_findings
+    from jawusd.media.checks import decoded_findings, rate_findings
     from jawusd.media.footage import open_clip
 
     for camera in parts.given.cameras:
@@ -232,7 +232,7 @@ def _rescaled(parts: Parts) -> Iterator[Finding]:
 
 def boards(parts: Parts) -> Iterator[Finding]:
     """Open the board clips if the cameras must be calibrated from them."""
-    from jawusd.media.clip_checks import decoded_findings
+    from jawusd.media.checks import decoded_findings
     from jawusd.media.footage import open_clip
 
     capture = parts.given

@@ -20,7 +20,7 @@ _CROWN_POINTS = 6000
 
 def masks(parts: Parts) -> Iterator[Finding]:
     """Check a sample of the masks of every camera."""
-    from jawusd.media.mask_survey import sample_masks, survey_masks
+    from jawusd.media.checks import sample_masks, survey_masks
     from jawusd.media.masks import mask_size_px
 
     capture = parts.given

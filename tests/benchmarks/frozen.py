@@ -29,7 +29,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "support"))
 
 from damaged_clips import write_gray
 
-from jawusd.media.clip_checks import picture_changes, repeated_runs
+from jawusd.media.checks import picture_changes, repeated_runs
 from jawusd.media.video import Video
 
 SIZE = (320, 180)

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from damaged_clips import packets, with_zeros, write_gray
 
-from jawusd.media import clip_checks
-from jawusd.media.clip_checks import decoded_findings, rate_findings
+from jawusd.media import checks
+from jawusd.media.checks import decoded_findings, rate_findings
 from jawusd.media.video import Video
 from jawusd.media.writers import VideoWriter
 
@@ -150,8 +150,8 @@ def test_damage_anywhere_in_a_clip_is_found(tmp_path, number):
 
 def test_long_clips_are_decoded_in_parts_and_at_both_ends(tmp_path, monkeypatch):
     video = Video(write_gray(tmp_path / "a.mp4", np.zeros((500, 16, 16), np.uint8)))
-    assert clip_checks._parts(video) == [(0, 500)]
-    monkeypatch.setattr(clip_checks, "_DECODED_PX", 16 * 16 * 400)
-    parts = clip_checks._parts(video)
+    assert checks._parts(video) == [(0, 500)]
+    monkeypatch.setattr(checks, "_DECODED_PX", 16 * 16 * 400)
+    parts = checks._parts(video)
     assert parts[0] == (0, 96) and parts[-1] == (404, 500) and sum(b - a for a, b in parts) <= 400
     assert all(0 <= a < b <= 500 for a, b in parts)

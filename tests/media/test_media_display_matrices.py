@@ -6,7 +6,7 @@ import pytest
 from PIL import Image
 
 from jawusd.base.errors import CaptureError
-from jawusd.media.clip_checks import decoded_findings
+from jawusd.media.checks import decoded_findings
 from jawusd.media.pictures import read_picture, read_stored
 from jawusd.media.video import Video
 

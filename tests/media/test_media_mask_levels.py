@@ -10,8 +10,8 @@ from PIL import Image, ImageDraw
 
 from jawusd.base.errors import CaptureError
 from jawusd.formats.capture_parts import CameraSource, Masks
+from jawusd.media.checks import survey_masks
 from jawusd.media.mask_levels import MOST_SOFT, MaskLevels
-from jawusd.media.mask_survey import survey_masks
 from jawusd.media.masks import MaskReader, open_masks
 
 SIZE = (160, 96)

@@ -12,7 +12,7 @@ from clip_files import KINDS, with_exr_header, write_picture, write_prores, writ
 from jawusd.base.errors import CaptureError
 from jawusd.formats.clips import ClipSource
 from jawusd.formats.file_names import gaps, groups, numbered_files
-from jawusd.media.clip_checks import rate_findings
+from jawusd.media.checks import rate_findings
 from jawusd.media.footage import open_clip
 from jawusd.media.pictures import read_header, read_stored
 from jawusd.media.pixels import to_display

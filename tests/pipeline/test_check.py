@@ -310,7 +310,7 @@ def test_the_program_prints_findings_and_leaves_with_5(capture, monkeypatch):
 
 def test_a_black_picture_in_between_does_not_end_the_masks(tmp_path):
     from jawusd.formats.capture_parts import CameraSource, Masks
-    from jawusd.media.mask_survey import sample_masks
+    from jawusd.media.checks import sample_masks
 
     for k in range(40):
         picture = np.zeros((90, 160), np.uint8)

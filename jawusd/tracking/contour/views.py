@@ -15,8 +15,8 @@ from jawusd.base.errors import TrackingError
 from jawusd.formats.capture import CameraSource
 from jawusd.formats.finding import Finding
 from jawusd.geometry import Camera
+from jawusd.media.checks import ARCHES, odd_pictures, survey_masks
 from jawusd.media.clip import read_backwards
-from jawusd.media.mask_survey import ARCHES, odd_pictures, survey_masks
 from jawusd.media.masks import FrameMasks, MaskReader, open_masks
 from jawusd.media.working_view import WorkingView
 
