@@ -15,10 +15,12 @@ from pydantic import BaseModel, Field, ValidationError
 from pydantic.fields import FieldInfo
 
 _CLOSE = 0.6  # minimum difflib ratio of a misspelt and a suggested key; 0.89 for "mask" and "masks"
+_REFERENCE = "`jawusd init --reference` lists all keys."
 _ALLOWED_SHOWN = 300  # maximum length of a list of keys in a message [characters]
 
 T = TypeVar("T")
 Location = tuple[int | str, ...]
+_UNKNOWN = "extra_forbidden"  # pydantic's error type for unknown keys
 #: Messages by pydantic's error type; names in braces are keys of the error's context.
 _WORDS = {
     "greater_than": "must be greater than {gt:g}",
@@ -100,7 +102,7 @@ def entries(
             inner.append((table, f"{prefix}{name}.", below))
         else:
             written = f"{table.strip('[]')}.{name}".lstrip(".")
-            inner.append((f"[[{written}]]" if many else f"[{written}]", "", below))
+            inner.append((_header(written, many), "", below))
     for written, before, below in inner:
         yield from entries(below, written, before, skipped)
 
@@ -180,14 +182,14 @@ def problems_of(
 ) -> list[tuple[str, str | None]]:
     """Return the problems of a model's validation of `data`: sentences that name table and key, and hints or None."""
     found = error.errors()
-    unknown = [(problem["loc"][:-1], str(problem["loc"][-1])) for problem in found if _is_unknown(problem["type"])]
+    unknown = [(problem["loc"][:-1], str(problem["loc"][-1])) for problem in found if problem["type"] == _UNKNOWN]
     deeper = {problem["loc"][:depth] for problem in found for depth in range(len(problem["loc"]))}
     out = []
-    for problem in sorted(found, key=lambda problem: not _is_unknown(problem["type"])):
+    for problem in sorted(found, key=lambda problem: problem["type"] != _UNKNOWN):
         location, kind = problem["loc"], problem["type"]
         if kind == "too_short" and location in deeper:
             continue  # errors of the list's entries are reported instead
-        if _is_unknown(kind):
+        if kind == _UNKNOWN:
             out.append(_unknown_key(str(location[-1]), location[:-1], model, place(location[:-1], data)))
         elif kind == "missing" and any(
             table == location[:-1] and _meant(key, [str(location[-1])]) for table, key in unknown
@@ -196,10 +198,6 @@ def problems_of(
         else:
             out.append(_wrong_value(problem, location, model, data))
     return out
-
-
-def _is_unknown(kind: str) -> bool:
-    return kind == "extra_forbidden"
 
 
 def place(location: Location, data: Mapping[str, object]) -> str:
@@ -226,19 +224,17 @@ def place(location: Location, data: Mapping[str, object]) -> str:
 
 def _unknown_key(key: str, table: Location, model: type[BaseModel], where: str) -> tuple[str, str | None]:
     """Return the message and hint for an unknown key: the allowed keys, and a suggestion."""
-    allowed = [name for name in _keys(_model_at(table, model)) if name != "folder"]
-    top = [name for name in _keys(model) if name != "folder"]
+    allowed = _keys(_model_at(table, model))
     inside = f"{where}: " if where else ""
     meant = _meant(key, allowed)
-    elsewhere = "" if meant or not where else next((name for name in top if name == key), "")
     if meant:
         advice = f'Did you mean "{meant}"?'
-    elif elsewhere:
+    elif where and key in _keys(model):
         advice = f'"{key}" goes at the top of the file, before the first [table].'
     elif owner := _owner(key, model):
         advice = f'"{key}" belongs to {owner}.'
     else:
-        advice = "`jawusd init --reference` lists all keys."
+        advice = _REFERENCE
     listed = ", ".join(allowed if table else ["format", "units", *allowed])
     return f'{inside}unknown key "{key}"; allowed keys: {listed[:_ALLOWED_SHOWN]}.', advice
 
@@ -263,19 +259,18 @@ def _wrong_value(
         return f"[{name}] is a single table; write [[{name}]], with double brackets, for each one.", None
     field = _named(location[-1], _model_at(location[:-1], model)) if location else None
     below, many = (None, False) if field is None else table_model(field)
-    key = Key("") if field is None else describe_key(field)
-    if below is not None and not key.meaning and kind == "missing":
-        return (
-            f"[[{name}]] is missing." if many else f"[{name}] is missing.",
-            "`jawusd init --reference` lists all keys.",
-        )
+    doc = Key("") if field is None else describe_key(field)
+    if below is not None and not doc.meaning and kind == "missing":
+        return f"{_header(name, many)} is missing.", _REFERENCE
     words = _WORDS.get(kind)
     if "pattern" in values:
         values = {**values, "signs": _signs(str(values["pattern"]))}
-    text = words.format(**{"actual_length": "too many", **values}) if words else _needed(kind, str(problem["msg"]))
-    unit = f" ({key.unit})" if key.unit and (" number " in text or kind.startswith(("greater", "less"))) else ""
+    message = str(problem["msg"])
+    needed = next((needed for kinds, needed in _NEEDED if kind.startswith(kinds)), message[:1].lower() + message[1:])
+    text = words.format(**{"actual_length": "too many", **values}) if words else needed
+    unit = f" ({doc.unit})" if doc.unit and (" number " in text or kind.startswith(("greater", "less"))) else ""
     shows_form = kind not in ("too_long", "too_short", "string_too_short")
-    hint = f"For example: {name} = {key.example}." if key.example and shows_form else None
+    hint = f"For example: {name} = {doc.example}." if doc.example and shows_form else None
     return f"{said or 'the file'}{_found(kind, given)} {text}{unit}.".replace("'", '"'), hint
 
 
@@ -295,13 +290,6 @@ def _found(kind: str, given: object) -> str:
     return f" = {shown:.80}" if kind in _WORDS else f" = {shown:.80}:"
 
 
-def _needed(kind: str, message: str) -> str:
-    for kinds, words in _NEEDED:
-        if kind.startswith(kinds):
-            return words
-    return message[:1].lower() + message[1:]
-
-
 def _meant(key: str, allowed: Iterable[str]) -> str:
     """Return the allowed key most similar to a misspelt one, "" if there is none."""
     plain = {re.sub(r"[^a-z0-9]", "", name.lower()): name for name in allowed}
@@ -310,7 +298,9 @@ def _meant(key: str, allowed: Iterable[str]) -> str:
 
 
 def _keys(model: type[BaseModel] | None) -> list[str]:
-    return [] if model is None else [field.alias or name for name, field in model.model_fields.items()]
+    """Return the keys of a model as written in the file; the folder of a capture is not written."""
+    fields = {} if model is None else model.model_fields
+    return [field.alias or name for name, field in fields.items() if name != "folder"]
 
 
 def _model_at(table: Location, model: type[BaseModel]) -> type[BaseModel] | None:
@@ -332,6 +322,9 @@ def _owner(key: str, model: type[BaseModel]) -> str:
     for name, field in model.model_fields.items():
         below, many = table_model(field)
         if below is not None and key in _keys(below):
-            written = field.alias or name
-            return f"[[{written}]]" if many else f"[{written}]"
+            return _header(field.alias or name, many)
     return ""
+
+
+def _header(name: str, many: bool) -> str:
+    return f"[[{name}]]" if many else f"[{name}]"

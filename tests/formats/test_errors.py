@@ -4,7 +4,7 @@ import pickle
 
 import pytest
 
-from jawusd.base.errors import CalibrationError, TrackingError
+from jawusd.base.errors import CalibrationError, TrackingError, errors_name_file
 
 
 @pytest.mark.parametrize(
@@ -22,3 +22,14 @@ def test_errors_print_where_first_and_survive_pickling(error, printed):
     copy = pickle.loads(pickle.dumps(error))
     assert str(error) == str(copy) == printed
     assert type(copy) is type(error) and vars(copy) == vars(error)
+
+
+@pytest.mark.parametrize(("path", "named"), [(None, "a.csv: no rows."), ("b.csv", "b.csv: no rows.")])
+def test_readers_name_their_file_unless_another_is_named(path, named):
+    @errors_name_file
+    def read(file, words):
+        raise TrackingError(words, path=path)
+
+    with pytest.raises(TrackingError) as error:
+        read("a.csv", words="no rows.")
+    assert str(error.value) == named
