@@ -144,20 +144,25 @@ def _crossing(corners: Array, f: int, x: float, z: float) -> tuple[int, float]:
 
 
 @numba.njit(nogil=True, cache=True)
+def _over(columns: _Columns, x: float, z: float) -> tuple[int, int]:
+    """Return the range of ``columns.faces`` that may lie on a vertical line, empty outside the columns."""
+    low, shape, start, _ = columns
+    i, k = int(np.floor((x - low[0]) / _BUCKET_MM)), int(np.floor((z - low[1]) / _BUCKET_MM))
+    if i < 0 or k < 0 or i >= shape[0] or k >= shape[1]:
+        return 0, 0
+    return start[i * shape[1] + k], start[i * shape[1] + k + 1]
+
+
+@numba.njit(nogil=True, cache=True)
 def _crossings(points: Array, corners: Array, columns: _Columns) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return the winding number at each point, and the type of the lowest crossing below it (1 enters, -1 leaves)."""
-    low, shape, start, faces = columns
     count = np.zeros(len(points), np.int64)
     first = np.zeros(len(points), np.int64)
     for p in range(len(points)):
-        i = int(np.floor((points[p, 0] - low[0]) / _BUCKET_MM))
-        k = int(np.floor((points[p, 2] - low[1]) / _BUCKET_MM))
-        if i < 0 or k < 0 or i >= shape[0] or k >= shape[1]:
-            continue
         lowest = np.inf
-        square = i * shape[1] + k
-        for j in range(start[square], start[square + 1]):
-            kind, height = _crossing(corners, faces[j], points[p, 0], points[p, 2])
+        begin, end = _over(columns, points[p, 0], points[p, 2])
+        for j in range(begin, end):
+            kind, height = _crossing(corners, columns.faces[j], points[p, 0], points[p, 2])
             if kind != 0 and height < points[p, 1]:
                 count[p] += kind
                 if height < lowest:
@@ -170,19 +175,16 @@ def _crossings(points: Array, corners: Array, columns: _Columns) -> tuple[NDArra
 def _set_signs(
     values: NDArray[np.float32], corners: Array, origin: Array, step: float, up: float, columns: _Columns
 ) -> None:
-    low, shape, start, faces = columns
     heights, kinds = np.empty(_MOST_CROSSINGS), np.empty(_MOST_CROSSINGS, np.int64)
     nx, ny, nz = values.shape
     for i in range(nx):
-        x = origin[0] + i * step + 1.23e-4
+        x = origin[0] + i * step + _JITTER_MM[0]
         for k in range(nz):
-            z = origin[2] + k * step + 2.71e-4
-            a, b = int(np.floor((x - low[0]) / _BUCKET_MM)), int(np.floor((z - low[1]) / _BUCKET_MM))
-            if a < 0 or b < 0 or a >= shape[0] or b >= shape[1]:
-                continue
-            found, square = 0, a * shape[1] + b
-            for j in range(start[square], start[square + 1]):
-                kind, height = _crossing(corners, faces[j], x, z)
+            z = origin[2] + k * step + _JITTER_MM[2]
+            found = 0
+            begin, end = _over(columns, x, z)
+            for j in range(begin, end):
+                kind, height = _crossing(corners, columns.faces[j], x, z)
                 if kind != 0 and found < _MOST_CROSSINGS:
                     heights[found], kinds[found] = height, kind
                     found += 1
