@@ -1,4 +1,4 @@
-"""Results of the paper's experiments on one take, for figures and a table."""
+"""Results of the paper's experiments on one take, for figures and a table in CSV with the columns `TABLE_COLUMNS`."""
 
 from __future__ import annotations
 
@@ -7,8 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from jawusd.base.arrays import Array
-from jawusd.base.errors import AnyPath
-from jawusd.formats.atomic import write_csv_atomic
 
 TABLE_COLUMNS = ("experiment", "model", "quantity", "count", "mean_mm", "median_mm", "p95_mm", "max_mm")
 
@@ -92,12 +90,3 @@ class Experiments:
     def table(self) -> list[dict[str, str | int | float]]:
         """Return the rows of the table as dictionaries with the keys `TABLE_COLUMNS`."""
         return [found.row() for found in self.distances]
-
-
-def save_table(path: AnyPath, rows: list[dict[str, str | int | float]]) -> None:
-    """Write a table of experiments as CSV, atomically.
-
-    Raises:
-        OutputError: the file cannot be written.
-    """
-    write_csv_atomic(path, TABLE_COLUMNS, rows)

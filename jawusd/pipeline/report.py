@@ -13,8 +13,9 @@ from typing import TypeVar
 from typing_extensions import TypedDict
 
 from jawusd.base.errors import FormatError, JawusdError, MissingDependencyError, explain_missing_packages
+from jawusd.formats.atomic import write_csv_atomic
 from jawusd.formats.capture import Capture
-from jawusd.formats.experiments import Experiments, save_table
+from jawusd.formats.experiments import TABLE_COLUMNS, Experiments
 from jawusd.formats.finding import Finding, FoundJson
 from jawusd.formats.model import JawModel, load_model
 from jawusd.formats.notes import SyncNotes
@@ -317,7 +318,7 @@ def draw_experiments(found: Experiments, folder: Path) -> list[Path]:
     from jawusd.paper import figures
 
     files = figures.draw_experiments(found, folder)
-    save_table(folder / TABLE_FILE, found.table())
+    write_csv_atomic(folder / TABLE_FILE, TABLE_COLUMNS, found.table())
     return [*files, folder / TABLE_FILE]
 
 

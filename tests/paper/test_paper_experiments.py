@@ -9,7 +9,8 @@ import trimesh
 
 from jawusd.fitting import FittingConfig
 from jawusd.fitting.data import PARAMETERS, SubjectAnatomy, select_poses
-from jawusd.formats.experiments import TABLE_COLUMNS, CondylePath, save_table
+from jawusd.formats.atomic import write_csv_atomic
+from jawusd.formats.experiments import TABLE_COLUMNS, CondylePath
 from jawusd.formats.mesh import Mesh
 from jawusd.formats.tracks import TRACKED, Tracks
 from jawusd.geometry import make_transform, se3_exp, transform_point, transform_points
@@ -168,7 +169,7 @@ def test_rows_repeat_the_distances(found):
 
 @pytest.mark.slow
 def test_the_table_is_written_as_csv(found, tmp_path):
-    save_table(tmp_path / "t.csv", found.table())
+    write_csv_atomic(tmp_path / "t.csv", TABLE_COLUMNS, found.table())
     lines = (tmp_path / "t.csv").read_text().splitlines()
     assert lines[0] == ",".join(TABLE_COLUMNS) and len(lines) == len(found.table()) + 1
 
