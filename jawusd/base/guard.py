@@ -14,11 +14,10 @@ import signal
 import sys
 import time
 from collections.abc import Iterator
-from os import PathLike
 from pathlib import Path
 from typing import NoReturn
 
-from jawusd.base.errors import ResourceError
+from jawusd.base.errors import AnyPath, ResourceError
 
 try:
     import resource
@@ -128,7 +127,7 @@ def _lower(kind: int, most: int) -> None:
         resource.setrlimit(kind, (most, hard))
 
 
-def out_of_memory(path: str | PathLike[str] | None = None) -> ResourceError:
+def out_of_memory(path: AnyPath | None = None) -> ResourceError:
     """Return the out-of-memory error for a file, by default the one recorded last; its message includes the limit."""
     limits = []
     if resource is not None:
@@ -143,7 +142,7 @@ def out_of_memory(path: str | PathLike[str] | None = None) -> ResourceError:
 _MORE = f"Raise the limit with {SETTING} (and ulimit -v), or use a smaller input."
 
 
-def note_input(path: str | PathLike[str]) -> None:
+def note_input(path: AnyPath) -> None:
     """Record the file about to be read, which the error message names if the program crashes."""
     if _current is not None:
         name = os.fsencode(os.path.abspath(path))[: mmap.PAGESIZE - 1]
