@@ -48,6 +48,15 @@ _SHORTEST_RANGE_MM = 1.0
 _TOLERANCE_QUANTILE, _LARGEST_TOLERANCE_MM = 0.95, 1.0
 
 
+def fit_bounds(d: Array, alpha: float, closed_mm: float | None = None) -> dict[str, Array]:
+    """Return all arrays of a model that describe its bounds, for captured parameters (N, 3) [mm] in temporal order.
+
+    `alpha` is as in `alpha_shape`, `closed_mm` as in `fit_slice_hull`.
+    """
+    hull, tolerances = fit_slice_hull(d, closed_mm)
+    return {**hull, **alpha_shapes(d, alpha), "d_range": valid_box(hull), **tolerances}
+
+
 def alpha_shapes(d: Array, alpha: float) -> dict[str, Array]:
     """Return the `polygon_*` arrays of a model for captured parameters (N, 3) [mm]; `alpha` as in `alpha_shape`."""
     arrays: dict[str, Array] = {}

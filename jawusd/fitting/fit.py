@@ -10,15 +10,18 @@ from typing import ParamSpec, TypeVar
 import numpy as np
 import scipy
 from numpy.typing import ArrayLike
+from scipy.spatial import cKDTree
 from threadpoolctl import threadpool_limits
 
 from jawusd.base.arrays import Array, Mask
 from jawusd.base.errors import EvaluatorError, FittingError
 from jawusd.evaluator import JawRig
+from jawusd.evaluator.authoring import error_growth_at
+from jawusd.evaluator.models import JawModelForm
 from jawusd.evaluator.speeds import Speeds
 from jawusd.fitting.additive import fit_additive, fit_pca
 from jawusd.fitting.anchored import fit_anchored
-from jawusd.fitting.bounds import alpha_shapes, fit_slice_hull, valid_box
+from jawusd.fitting.bounds import fit_bounds
 from jawusd.fitting.checks import AnatomyWarning, check_anatomy, missing_movements, shown_parameters
 from jawusd.fitting.data import (
     FittedForm,
@@ -30,9 +33,9 @@ from jawusd.fitting.data import (
     screened,
     select,
 )
-from jawusd.fitting.error_table import seen_errors, unseen_errors
-from jawusd.formats.model import JawModel
+from jawusd.formats.model import JawModel, error_table
 from jawusd.formats.notes import ErrorTable
+from jawusd.geometry import LANDMARKS, transform_point
 
 Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")
@@ -56,6 +59,13 @@ FORMS: Mapping[str, FormFitter] = {
     "pca": lambda data, shown, config: fit_pca(data, shown),
 }
 _FASTEST_MM_S2 = 3e4  # maximum plausible acceleration, three times gravity; larger accelerations are jumps of the poses
+# Fraction of held-out errors, weighted by reach, that are below their quantile at the expected growth; and this
+# quantile relative to the rms error for three normally distributed coordinates.
+_BELOW, _LARGEST_RMS = 0.9, 1.443
+_USUAL_GROWTH = 1.0  # growth of errors per mm of reach, relative to the rms error of training frames [1/mm]
+_OWN = 0.75  # weight of the growth that a take shows itself, on a logarithmic scale
+_SLOWEST_GROWTH = 0.01  # minimum growth of errors with reach [mm/mm]
+_SMALLEST_MM = 1e-6  # a smaller reach is treated as this one
 
 
 @dataclass(frozen=True)
@@ -154,18 +164,14 @@ def fit_model(
         raise FittingError("some training poses cannot be encoded.", hint="Check the units of the poses.")
     captured_d = d[:: -(-len(d) // _MOST_CAPTURED)]
     warnings += [AnatomyWarning("take_lacks", sentence) for sentence in missing_movements(captured_d, shown)]
-    hull, tolerances = fit_slice_hull(d)
     arrays = {
         **form.model.arrays(),
-        **hull,
-        **alpha_shapes(d, config.alpha),
+        **fit_bounds(d, config.alpha),
         "T_anatomical_skull": anatomy.T_anatomical_skull,
         "T_rest": anatomy.T_rest,
         "incisor": data.incisor,
         "landmarks": anatomy.landmarks,
-        "d_range": valid_box(hull),
         "codes": captured_d,
-        **tolerances,
     }
     meta: dict[str, object] = {
         "actor": actor,
@@ -189,7 +195,8 @@ def _errors(
     notify: Callable[[int], None],
 ) -> tuple[dict[str, ErrorTable], dict[str, dict[str, float]], Array]:
     """Return the error tables of a fit by name, and the other results of `unseen_errors` (empty without hold-out)."""
-    tables = seen_errors(data, form)
+    parts = {"train": form.kept, "trimmed": ~form.kept}
+    tables = {name: error_table(_form_errors(data.select(rows), form)) for name, rows in parts.items() if rows.any()}
     if not config.holdout_folds:
         return tables, {}, np.zeros(0)
     # In the folds, method "paper" trains only one network, with the seed of the best network in the full fit.
@@ -199,6 +206,76 @@ def _errors(
         data, form, config.holdout_folds, lambda part: forms[config.method](part, shown, again), notify
     )
     return tables, uncertainty, rms_mm
+
+
+def pose_errors(data: TrainingData, model: Array) -> dict[str, Array]:
+    """Return distances (N,) [mm] between model (N, 4, 4) and data by landmark; "mandible" is its farthest vertex."""
+    errors = {"mandible": data.metric.largest(model, data.motion)}
+    for name, point in zip(LANDMARKS, data.landmarks, strict=True):
+        errors[name] = np.linalg.norm(transform_point(model, point) - transform_point(data.motion, point), axis=-1)
+    return errors
+
+
+def unseen_errors(
+    data: TrainingData,
+    form: FittedForm,
+    folds: int,
+    refit: Callable[[TrainingData], FittedForm],
+    notify: Callable[[int], None],
+) -> tuple[ErrorTable, dict[str, dict[str, float]], Array]:
+    """Cross-validate: hold out contiguous parts of a take in turn, refit, and measure the error on the held-out parts.
+
+    Args:
+        form: the fit to all frames; only the errors of frames that it did not trim count.
+        notify: called with the index of each part before it is processed.
+
+    Returns:
+        The error table; the growth of the errors away from the training poses, for each landmark and the mandible, as
+        coefficients base_mm and per_mm of `jawusd.evaluator.authoring.error_growth_at`; and the rms landmark error of
+        every held-out frame [mm], shape (n,).
+    """
+    fold = np.arange(len(data)) * folds // len(data)
+    errors, growths = [], []
+    for k in range(folds):
+        notify(k)
+        seen, unseen = data.select(fold != k), data.select((fold == k) & form.kept)
+        if not len(unseen):
+            continue
+        part = refit(seen)
+        errors.append(_form_errors(unseen, part))
+        growths.append(_growth_at(part.model, seen.select(part.kept), unseen))
+    pooled = {name: np.concatenate([part[name] for part in errors]) for name in errors[0]}
+    factor, reach = np.concatenate(growths, axis=1)
+    trained = _form_errors(data.select(form.kept), form)
+    within = factor == 1.0  # a wider opening has a growth of its own
+    growth = {name: _growth(reach[within], values[within], trained[name]) for name, values in pooled.items()}
+    rms = np.sqrt(np.mean([pooled[name] ** 2 for name in LANDMARKS], axis=0))
+    return error_table(pooled), growth, rms
+
+
+def _form_errors(data: TrainingData, form: FittedForm) -> dict[str, Array]:
+    return pose_errors(data, data.metric.nearest(form.model, data.motion)[1])
+
+
+def _growth_at(model: JawModelForm, seen: TrainingData, unseen: TrainingData) -> Array:
+    """Return factor and reach [mm] of each held-out frame from the training frames (`error_growth_at`), (2, N)."""
+    captured, wanted = (part.metric.nearest(model, part.motion)[0] for part in (seen, unseen))
+    captured, wanted = captured[np.isfinite(captured).all(1)], np.nan_to_num(wanted)
+    return np.stack(error_growth_at(captured, wanted, cKDTree(captured).query(wanted)[0]))
+
+
+def _growth(reach: Array, errors: Array, seen: Array) -> dict[str, float]:
+    """Return the rms error of training frames, and the growth with reach [mm] that bounds most held-out errors.
+
+    With few frames the growth is uncertain, so it is averaged on a logarithmic scale with a multiple of the rms error.
+    """
+    base = float(np.sqrt(np.mean(seen**2)))
+    usual = found = _USUAL_GROWTH * base
+    if len(reach):
+        weights = np.maximum(reach, _SMALLEST_MM)
+        slopes = np.maximum(errors / _LARGEST_RMS - base, 0.0) / weights
+        found = max(float(np.quantile(slopes, _BELOW, weights=weights, method="inverted_cdf")), 0.0)
+    return {"base_mm": base, "per_mm": max(found**_OWN * usual ** (1.0 - _OWN), _SLOWEST_GROWTH)}
 
 
 def _model(

@@ -19,7 +19,7 @@ from jawusd.evaluator import JawRig
 from jawusd.evaluator.curves import GlideTable
 from jawusd.evaluator.gauge import Gauge
 from jawusd.evaluator.models import AnchoredModel
-from jawusd.fitting.bounds import alpha_shapes, fit_slice_hull, valid_box
+from jawusd.fitting.bounds import fit_bounds
 from jawusd.fitting.data import ranges_of
 from jawusd.fitting.gauge_fit import SMALLEST_MINOR, smallest_minor
 from jawusd.formats.model import JawModel
@@ -64,17 +64,14 @@ def follow_teeth(model: JawModel, teeth: Teeth) -> JawModel:
 def _regauged(model: JawModel, old: Gauge, gauge: Gauge, d: Array) -> JawModel:
     """Return the model with a new gauge, its parameters d (F, 3), and bounds that end at closed teeth."""
     trained = d[model.trained]
-    hull, tolerances = fit_slice_hull(trained, closed_mm=0.0)
     config = model.meta["config"]
     alpha = float(config["alpha"]) if isinstance(config, dict) else 1.0
+    bounds = fit_bounds(trained, alpha, closed_mm=0.0)
     arrays = {
         **model.arrays,
         **gauge.arrays(),
-        **hull,
-        **alpha_shapes(trained, alpha),
-        "d_range": valid_box(hull),
+        **{name: value for name, value in bounds.items() if name in model.arrays},
         "codes": _carried(old, gauge, model.arrays["codes"]),
-        **{name: value for name, value in tolerances.items() if name in model.arrays},
     }
     return replace(model, arrays=arrays, d=d, meta={**model.meta, "ranges_mm": ranges_of(trained)})
 

@@ -1,5 +1,7 @@
 """The jaw in a shot from points on the skin, learned in the frames of the same shot in which the teeth are visible.
 
+The pose of the head comes from points that follow the head, which are visible even if the teeth are not.
+
 Each coordinate of a point follows a quadratic polynomial of d. What this leaves is described by a few components, for
 expressions, and by a variance of each coordinate. In the other frames, d is the most probable value given the points
 that are found (generalised least squares).
@@ -16,17 +18,17 @@ from typing import NamedTuple
 import numpy as np
 
 from jawusd.base.arrays import Array, Mask
+from jawusd.base.errors import FittingError
 from jawusd.evaluator import JawRig
 from jawusd.evaluator.skin import SkinJaw
-from jawusd.fitting.skin_points import LEAST_MOVING
-from jawusd.fitting.skin_training import (
-    blocks_of,
-    check_errors,
-    check_motion,
-    head_motions,
-    held_out_errors,
-    training_rows,
-)
+from jawusd.fitting import face
+from jawusd.geometry import rigid_fit, se3_inverse, transform_points
+
+_LEAST_SHARE = 0.4  # minimum fraction of the frames in which a point is found
+_FIXED_MM = 0.6  # maximum typical distance of a point that follows the head from its mean position
+_LEAST_FIXED, _LEAST_MOVING = 8, 12  # minimum numbers of points that follow the head, and of other points
+_LEAST_SPREAD_MM = 6.0  # minimum extent of the points that follow the head along their second principal axis
+_HEAD_ROUNDS, _HEAD_OUTLIER = 4, 2.5  # rounds of reweighting points, and robust sigma beyond which they count less
 
 _COMPONENTS = 12  # number of components of the motion that does not depend on d
 _FLOOR_MM = 0.05  # standard deviation of the points that is added to that in the training frames
@@ -42,6 +44,68 @@ _PRIOR = 3.0  # standard deviation of d before any point is seen, relative to th
 # Factor on the covariance: errors of neighbouring points are alike. See docs/explanation/constants.md.
 _WIDER = 3.0
 _MEDIAN_SQUARE = 0.455  # median of the square of a standard normal variable
+
+
+def in_head(points: Array, T_world_head: Array, seen: Mask) -> Array:
+    """Return the points in the skull frame.
+
+    Args:
+        points: points on the skin in the world [mm], NaN where they are not found, shape (F, N, 3).
+        T_world_head: poses of the head, correct where the teeth are visible, shape (F, 4, 4).
+        seen: frames in which the teeth are visible, shape (F,).
+
+    Returns:
+        Points (F, M, 3) [mm] in the skull frame; NaN where they or too few points on the head are found.
+
+    Raises:
+        FittingError: too few points are found, or too few of them follow the head.
+    """
+    local = transform_points(se3_inverse(T_world_head[seen]), points[seen])
+    present = np.isfinite(points[:, :, 0])
+    often = (present.mean(axis=0) >= _LEAST_SHARE) & (present[seen].mean(axis=0) >= _LEAST_SHARE)
+    points, local = points[:, often], local[:, often]
+    rest = np.nanmedian(local, axis=0)
+    off = np.nanquantile(np.linalg.norm(local - rest, axis=2), 0.75, axis=0)
+    fixed = off <= _FIXED_MM
+    _check_points(rest, fixed)
+    T = np.stack([_head_pose(rest[fixed], frame[fixed]) for frame in points])
+    T[seen] = T_world_head[seen]
+    return transform_points(se3_inverse(T), points)
+
+
+def _check_points(rest: Array, fixed: Mask) -> None:
+    count, moving = int(fixed.sum()), int((~fixed).sum())
+    spread = 0.0
+    if count >= 3:
+        centred = rest[fixed] - rest[fixed].mean(axis=0)
+        spread = 2 * float(np.linalg.svd(centred, compute_uv=False)[1]) / np.sqrt(count)
+    if moving < _LEAST_MOVING:
+        raise FittingError(
+            f"{moving} points on the skin of chin and lower face can be followed through the shot; at least "
+            f"{_LEAST_MOVING} are needed.",
+            hint="The skin needs texture that the cameras resolve: freckles, stubble, or painted dots of 1 to 2 mm. "
+            "Film closer, in focus and without glare.",
+        )
+    if count < _LEAST_FIXED or spread < _LEAST_SPREAD_MM:
+        raise FittingError(
+            f"{count} points on the skin follow the head, over {spread:.0f} mm; at least {_LEAST_FIXED} over "
+            f"{_LEAST_SPREAD_MM:g} mm are needed to determine the head pose where the teeth are hidden.",
+            hint="Film nose and cheeks too, or paint dots on them.",
+        )
+
+
+def _head_pose(rest: Array, found: Array) -> Array:
+    """Return the robust pose (4, 4) that moves points (N, 3) to the points found (N, 3), NaN if too few are found."""
+    known = np.isfinite(found[:, 0])
+    T = np.full((4, 4), np.nan)
+    if known.sum() < _LEAST_FIXED / 2:
+        return T
+    weights = np.ones(int(known.sum()))
+    for _ in range(_HEAD_ROUNDS):
+        T = rigid_fit(rest[known], found[known], weights)
+        off = np.linalg.norm(transform_points(T, rest[known]) - found[known], axis=1)
+        weights = 1.0 / (1.0 + (off / (_HEAD_OUTLIER * max(float(np.median(off)), 1e-6))) ** 2)
+    return T
 
 
 class ShotJaw(NamedTuple):
@@ -69,17 +133,17 @@ def jaw_of_points(rig: JawRig, X: Array, d: Array, seen: Mask, sigma_mm: float) 
             baseline; a chin rigid with the bone is none, since without skin, hidden frames are interpolated.
     """
     usable = seen & (np.isfinite(X[..., 0]).mean(axis=1) >= _LEAST_FOUND)
-    rows = training_rows(usable)
-    check_motion(np.nan_to_num(X[rows].reshape(len(rows), -1)), d[rows], np.array(sigma_mm))
+    rows = face.training_rows(usable)
+    face.check_motion(np.nan_to_num(X[rows].reshape(len(rows), -1)), d[rows], np.array(sigma_mm))
     held_out = np.empty((len(rows), 3))
-    blocks = blocks_of(len(rows))
+    blocks = face.blocks_of(len(rows))
     for block in blocks:
         others = np.delete(rows, block)
         held_out[block] = PointModel(X[others], d[others]).jaw(X[rows[block]])[0]
     model = PointModel(X[rows], d[rows])
-    errors = held_out_errors(rig, held_out, d[rows], blocks, model.filled)
-    check_errors({name: value for name, value in errors.items() if name != "chin"})
-    hidden = X[~seen & (np.isfinite(X[..., 0]).sum(axis=1) >= LEAST_MOVING)]
+    errors = face.held_out_errors(rig, held_out, d[rows], blocks, model.filled)
+    face.check_errors({name: value for name, value in errors.items() if name != "chin"})
+    hidden = X[~seen & (np.isfinite(X[..., 0]).sum(axis=1) >= _LEAST_MOVING)]
     found, covariance, _ = model.jaw(X, model.departures(hidden))
     # errors of the polynomials, which are alike in all points: robust variances of the held-out errors
     covariance = covariance + np.diag(np.median(np.square(held_out - d[rows]), axis=0) / _MEDIAN_SQUARE)
@@ -115,7 +179,7 @@ class PointModel:
         free = terms.shape[1]
         self._expressions = s[:_COMPONENTS, None] * Vt[:_COMPONENTS] / np.sqrt(len(X) - free)
         count = np.maximum(known.sum(axis=0) - free - _COMPONENTS, 1)
-        self._head = head_motions(self._mean, *_HEAD_ERROR)
+        self._head = face.head_motions(self._mean, *_HEAD_ERROR)
         self._variance = np.square(left - low).sum(axis=0) / count + _FLOOR_MM**2
 
     def covers(self, d: Array) -> Mask:
@@ -163,7 +227,7 @@ class PointModel:
         terms = _terms(u)
         nuisances = np.einsum("fij,fj->fi", inner, by_point[:, k:] - np.einsum("fij,fj->fi", every[:, k:, :k], terms))
         left = moved - terms @ self._slope - nuisances[:, : len(self._head)] @ self._head
-        few = known.sum(axis=1) < 3 * LEAST_MOVING
+        few = known.sum(axis=1) < 3 * _LEAST_MOVING
         u[few], covariance[few] = np.nan, np.nan
         covariance = _WIDER * covariance * self._size[:, None] * self._size
         return self._centre + u * self._size, covariance, np.where(known, left, np.nan).reshape(X.shape)

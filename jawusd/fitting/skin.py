@@ -19,17 +19,7 @@ from jawusd.base.errors import FittingError
 from jawusd.base.npz import TWIST_ORDER, UNITS
 from jawusd.evaluator import JawRig
 from jawusd.evaluator.skin import FAMILY, VERSION, Skin, components, skin_kernel
-from jawusd.fitting.face import COARSE_S, columns_at, offsets_between, refined_offset, unexplained
-from jawusd.fitting.skin_training import (
-    LEAST_FRAMES,
-    MOST_FRAMES,
-    blocks_of,
-    check_errors,
-    check_motion,
-    head_motions,
-    held_out_errors,
-    training_rows,
-)
+from jawusd.fitting import face
 from jawusd.formats.atomic import write_npz_atomic
 
 #: Default root mean square shift [mm] and rotation [rad] of the head that remain in later frames after stabilisation,
@@ -87,17 +77,17 @@ def fit_skin(
     sigma = np.broadcast_to(np.asarray(sigma_d, dtype=np.float64), d.shape)
     flat = X.reshape(len(X), -1)
     usable = np.asarray(seen, dtype=bool) & np.isfinite(np.column_stack([flat, d, sigma])).all(axis=1)
-    rows = training_rows(usable)
+    rows = face.training_rows(usable)
     X, flat, d, sigma = X[rows], flat[rows], d[rows], sigma[rows]
-    check_motion(flat, d, sigma)
-    blocks = blocks_of(len(rows))
+    face.check_motion(flat, d, sigma)
+    blocks = face.blocks_of(len(rows))
     arrays, held_out, variance = _process(flat, d, sigma, blocks)
     arrays["head_error"] = np.zeros((0, len(arrays["basis"])))
     if points:
-        moved = head_motions(X.mean(axis=0), *head_error) / np.sqrt(3)
+        moved = face.head_motions(X.mean(axis=0), *head_error) / np.sqrt(3)
         arrays["head_error"] = np.asarray(moved @ arrays["basis"].T / arrays["scale"])
-    errors = held_out_errors(rig, held_out, d, blocks, X)
-    check_errors(errors)
+    errors = face.held_out_errors(rig, held_out, d, blocks, X)
+    face.check_errors(errors)
     strange = np.column_stack([variance, _outside(flat, blocks, float(arrays["scale"]))])
     arrays["familiar_limit"] = np.maximum(np.quantile(strange, 1 - _FALSE_ALARMS / 2, axis=0), _TINY)
     flagged = (strange > arrays["familiar_limit"]).any(axis=1)
@@ -129,12 +119,12 @@ def clock_offset(face_s: Array, X: Array, times_s: Array, d: Array) -> float:
     known = X[np.isfinite(X).all(axis=1)]
     if not len(known):
         raise FittingError("no frame has values in all columns of the face data.")
-    known = known[:: max(len(known) // MOST_FRAMES, 1)]
+    known = known[:: max(len(known) // face.MOST_FRAMES, 1)]
     mean = known.mean(axis=0)
     f = (X - mean) @ np.linalg.svd(known - mean, full_matrices=False)[2][:_CLOCK_COMPONENTS].T
-    tried = offsets_between(face_s, times_s)
-    every = max(int(COARSE_S / np.median(np.diff(times_s))), 1)
-    explained = [_explained(columns_at(face_s + offset, f, times_s[::every]), d[::every, :2]) for offset in tried]
+    tried = face.offsets_between(face_s, times_s)
+    every = max(int(face.COARSE_S / np.median(np.diff(times_s))), 1)
+    explained = [_explained(face.columns_at(face_s + offset, f, times_s[::every]), d[::every, :2]) for offset in tried]
     best = int(np.argmax(explained))
     if explained[best] < _LEAST_EXPLAINED:
         raise FittingError(
@@ -142,15 +132,15 @@ def clock_offset(face_s: Array, X: Array, times_s: Array, d: Array) -> float:
             f"and laterotrusion at best; at least {_LEAST_EXPLAINED:.0%} is required.",
             hint="Use face and jaw data of the same performance, or set their offset with --offset.",
         )
-    return refined_offset(float(tried[best]), face_s, f, times_s, d)
+    return face.refined_offset(float(tried[best]), face_s, f, times_s, d)
 
 
 def _explained(f: Array, d: Array) -> float:
     """Return the smallest fraction of the variance of a column of d (N, n) that is linear in features (N, C)."""
     rows = np.isfinite(f).all(axis=1)
-    if rows.sum() < LEAST_FRAMES:
+    if rows.sum() < face.LEAST_FRAMES:
         return 0.0
-    return float((1 - unexplained(f[rows], d[rows]).var(axis=0) / d[rows].var(axis=0)).min())
+    return float((1 - face.unexplained(f[rows], d[rows]).var(axis=0) / d[rows].var(axis=0)).min())
 
 
 def save_skin(path: str | os.PathLike[str], skin: Skin) -> None:

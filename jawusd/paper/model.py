@@ -27,8 +27,7 @@ from jawusd.evaluator.models import AdditiveModel
 from jawusd.fitting import fit
 from jawusd.fitting.additive import MEASURED, Curve, in_millimetres
 from jawusd.fitting.data import FittedForm, TrainingData
-from jawusd.fitting.error_table import pose_errors
-from jawusd.fitting.fit import FormFitter
+from jawusd.fitting.fit import FormFitter, pose_errors
 from jawusd.formats.model import error_table
 from jawusd.geometry import se3_exp, se3_log
 

@@ -15,9 +15,8 @@ from jawusd.capture.skin_points import SkinTracker
 from jawusd.evaluator import JawRig
 from jawusd.evaluator.skin import SkinJaw
 from jawusd.fitting.face import columns_at
-from jawusd.fitting.shot_skin import ShotJaw, jaw_of_points
+from jawusd.fitting.shot_skin import ShotJaw, in_head, jaw_of_points
 from jawusd.fitting.skin import clock_offset
-from jawusd.fitting.skin_points import in_head
 from jawusd.formats.capture import Capture
 from jawusd.geometry import Camera, se3_inverse, transform_point
 from jawusd.media.pixels import ColourPicture

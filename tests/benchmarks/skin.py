@@ -38,7 +38,7 @@ from skin_takes import Skin  # noqa: E402
 import jawusd  # noqa: E402
 from jawusd.base.errors import FittingError  # noqa: E402
 from jawusd.evaluator.skin import SkinJaw  # noqa: E402
-from jawusd.fitting import skin_training as fitting  # noqa: E402
+from jawusd.fitting import face as fitting  # noqa: E402
 from jawusd.geometry import transform_points  # noqa: E402
 from jawusd.tracking.performance import motion  # noqa: E402
 from jawusd.tracking.performance.attempts import LARGEST_SIGMA  # noqa: E402

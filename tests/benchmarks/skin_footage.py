@@ -24,9 +24,8 @@ from skin_dots import DottedFace
 from skin_shot import write_skin_shot
 
 from jawusd.evaluator.skin import SkinJaw
-from jawusd.fitting.shot_skin import jaw_of_points
-from jawusd.fitting.skin_points import in_head
-from jawusd.fitting.skin_training import on_bone
+from jawusd.fitting.face import on_bone
+from jawusd.fitting.shot_skin import in_head, jaw_of_points
 from jawusd.formats.capture import load_capture
 from jawusd.geometry import transform_points
 from jawusd.pipeline.cameras import load_cameras, open_videos

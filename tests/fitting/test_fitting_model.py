@@ -12,7 +12,7 @@ from jawusd.evaluator import JawRig
 from jawusd.fitting import FittingConfig, fit_model
 from jawusd.fitting.additive import fit_pca
 from jawusd.fitting.data import SubjectAnatomy, select_poses
-from jawusd.fitting.error_table import unseen_errors
+from jawusd.fitting.fit import unseen_errors
 from jawusd.formats.model import load_model, save_model
 from jawusd.geometry import LANDMARKS, make_transform, random_rotation, se3_exp, so3_exp, transform_point
 from jawusd.synthetic.exercises import record

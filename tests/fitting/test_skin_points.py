@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from jawusd.base.errors import FittingError
-from jawusd.fitting.skin_points import in_head
+from jawusd.fitting.shot_skin import in_head
 from jawusd.geometry import make_transform, so3_exp, transform_points
 
 FRAMES, FIXED, MOVING = 90, 14, 16

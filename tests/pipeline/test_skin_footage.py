@@ -7,8 +7,8 @@ from run_jawusd import run
 from skin_dots import DottedFace
 
 from jawusd.base.errors import FittingError
-from jawusd.fitting.skin_points import in_head
-from jawusd.fitting.skin_training import on_bone
+from jawusd.fitting.face import on_bone
+from jawusd.fitting.shot_skin import in_head
 from jawusd.geometry import transform_points
 from jawusd.pipeline.solve_skin import SkinOfFootage
 
