@@ -30,7 +30,6 @@ PARAMETERS = ("opening", "laterotrusion", "protrusion")
 
 _MAX_FOLDERS = 20_000
 _MAX_INDEX_BYTES = 64 << 20
-_CHUNK_BYTES = 1 << 20
 
 #: Function that reads a rig from a file.
 Loader = Callable[[Path], JawRig]
@@ -154,8 +153,7 @@ def _content(path: Path, root: Path) -> str:
         total.update(part.name.encode() + b"\0")
         try:
             with open(part, "rb") as handle:
-                while chunk := handle.read(_CHUNK_BYTES):
-                    total.update(chunk)
+                hashlib.file_digest(handle, lambda: total)  # continues the hash
         except OSError as error:
             raise FormatError(f"{part.name} cannot be read: {error.strerror}.", path=path) from error
     return total.hexdigest()

@@ -75,11 +75,14 @@ _MIN_DONORS = 2  # minimum number of subjects for leave-one-out validation
 
 
 @dataclass(frozen=True, eq=False)
-class Expected:
-    """Errors of a leave-one-out validation."""
+class Learned:
+    """Result of leave-one-out validation over a library."""
 
-    # landmark errors [mm], shape (K, 5), by name of the held-out subject; predicted and true poses are compared at
-    # equal fractions of the ranges, so that errors of the ranges are included
+    # landmark distance at which a weight decreases to exp(-1/2); inf for equal weights; None if only the closest
+    # subject is used
+    bandwidth_mm: float | None
+    # landmark errors [mm], shape (K, 5), by name of the held-out subject, empty if the library has a single subject;
+    # predicted and true poses are compared at equal fractions of the ranges, so that errors of the ranges are included
     errors_mm: dict[str, Array]
 
     def pooled(self) -> Array:
@@ -103,16 +106,6 @@ class Expected:
 
 
 @dataclass(frozen=True, eq=False)
-class Learned:
-    """Result of leave-one-out validation over a library."""
-
-    # landmark distance at which a weight decreases to exp(-1/2); inf for equal weights; None if only the closest
-    # subject is used
-    bandwidth_mm: float | None
-    expected: Expected | None  # result of leave-one-out validation; None if the library has a single subject
-
-
-@dataclass(frozen=True, eq=False)
 class PersonalMotion:
     """Motion predicted for a subject."""
 
@@ -133,22 +126,19 @@ def leave_one_out(donors: Sequence[Donor], *, closest: bool = False) -> Learned:
     if not donors:
         raise FittingError("the library has no subject whose motion can be transferred.")
     if len(donors) < _MIN_DONORS:
-        return Learned(None, None)
-    choices: tuple[float | None, ...] = (None,) if closest else BANDWIDTHS_MM
-    errors: list[dict[str, Array]] = [{} for _ in choices]
+        return Learned(None, {})
+    choices = [Learned(bandwidth, {}) for bandwidth in ((None,) if closest else BANDWIDTHS_MM)]
     for i, left_out in enumerate(donors):
         others = [*donors[:i], *donors[i + 1 :]]
         shares, rest = _captured_shares(left_out, _POSES_LEFT_OUT), left_out.landmarks
         own = left_out.rig.landmarks
         truth = transform_points(left_out.rig.pose(left_out.rig.denormalized(shares)), own)
         moved = np.stack([displacements(donor, rest, shares) for donor in others])
-        for found, bandwidth in zip(errors, choices, strict=True):
-            average = np.einsum("j,jkpi->kpi", _weights(others, rest, bandwidth), moved)
+        for choice in choices:
+            average = np.einsum("j,jkpi->kpi", _weights(others, rest, choice.bandwidth_mm), moved)
             predicted = transform_points(rigid_fit(rest, rest + average), rest)
-            found[left_out.name] = np.linalg.norm(predicted - truth, axis=-1)
-    expected = [Expected(found) for found in errors]
-    best = int(np.argmin([found.pooled().mean() for found in expected]))
-    return Learned(choices[best], expected[best])
+            choice.errors_mm[left_out.name] = np.linalg.norm(predicted - truth, axis=-1)
+    return min(choices, key=lambda choice: float(choice.pooled().mean()))
 
 
 def personal_motion(donors: Sequence[Donor], target: Array, learned: Learned) -> PersonalMotion:

@@ -161,19 +161,19 @@ def fit_personal(subject: Subject, motion: PersonalMotion, progress: Progress) -
         progress=partial(progress, "fit"),
     )
     model.meta["inferred"] = list(subject.inferred)
-    expected, scale_mm = motion.learned.expected, motion.learned.bandwidth_mm
+    learned, scale_mm = motion.learned, motion.learned.bandwidth_mm
     model.meta["personal"] = {
         "weights": motion.weights,
         "landmark_distance_scale_mm": None if scale_mm is None or not np.isfinite(scale_mm) else scale_mm,
-        "expected_error_mm": None if expected is None else expected.summary(),
+        "expected_error_mm": learned.summary() if learned.errors_mm else None,
         "fit_to_carried_motion_mm": model.meta["errors"],
     }
     # The training error does not apply to this subject, whose motion was not measured.
-    model.meta["errors"] = {} if expected is None else {"expected": expected.table()}
+    model.meta["errors"] = {"expected": learned.table()} if learned.errors_mm else {}
     caution = {"code": "personal", "message": _caution(motion)}
     model.meta["warnings"] = [*fit_summary(model)["warnings"], caution]
-    if expected is not None:
-        limit = np.maximum(model.arrays["residual_limit_mm"], expected.pooled().mean())
+    if learned.errors_mm:
+        limit = np.maximum(model.arrays["residual_limit_mm"], learned.pooled().mean())
         model.arrays["residual_limit_mm"] = limit
     # Transferred poses are not a take of this subject, so the file gets no captured motion and no held-out frames.
     arrays = {name: value for name, value in model.arrays.items() if name not in HELD_OUT_ARRAYS}
@@ -183,9 +183,9 @@ def fit_personal(subject: Subject, motion: PersonalMotion, progress: Progress) -
 def _caution(motion: PersonalMotion) -> str:
     persons = f"{len(motion.weights)} library subject{'s' if len(motion.weights) > 1 else ''}"
     start = f"Made from landmarks and {persons}, not from a capture;"
-    if motion.learned.expected is None:
+    if not motion.learned.errors_mm:
         return f"{start} the expected error is unknown, because the library has a single subject."
-    found = motion.learned.expected.summary()
+    found = motion.learned.summary()
     return f"{start} expected error {found['mean']:.2f} mm, 95 % below {found['p95']:.2f} mm (leave-one-out)."
 
 

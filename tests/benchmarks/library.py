@@ -107,7 +107,7 @@ def tabulate(persons: list[Captured], generic: Donor) -> None:
         target = person.donor.landmarks
         alike = min(others, key=lambda donor: landmark_distance_mm(donor.landmarks, target))
         learned, learned_closest = leave_one_out(others), leave_one_out(others, closest=True)
-        promised = learned.expected.summary()["mean"]
+        promised = learned.summary()["mean"]
         rig = person.rig_from(others, target, learned)
         picked = target + rng.normal(scale=PICKING_SD_MM, size=target.shape)
         rows = {

@@ -74,7 +74,7 @@ def test_twins_predict_each_other_without_error_and_count_alike(donor):
     twins = [donor, Donor("two", person("two")), Donor("three", person("three"))]
     made = personal_motion(twins, donor.landmarks, leave_one_out(twins))
     assert sum(made.weights.values()) == pytest.approx(1) and len(made.weights) == 3
-    assert made.learned.expected.summary()["max"] < 1e-6
+    assert made.learned.summary()["max"] < 1e-6
     d, residual_mm = donor.rig.encode(made.poses @ donor.rig.T_rest)
     assert residual_mm.max() < 1e-6
     assert donor.rig.margin(d).min() > -0.5
@@ -89,7 +89,7 @@ def test_the_expected_error_of_a_person_does_not_use_that_person(donor):
     predicted = rigid_fit(odd.landmarks, odd.landmarks + displacements(donor, odd.landmarks, shares))
     truth = transform_points(odd.rig.pose(codes), odd.rig.landmarks)
     by_hand = np.linalg.norm(transform_points(predicted, odd.landmarks) - truth, axis=-1)
-    np.testing.assert_allclose(learned.expected.errors_mm["odd"], by_hand, atol=1e-6)
+    np.testing.assert_allclose(learned.errors_mm["odd"], by_hand, atol=1e-6)
     assert by_hand.mean() > 1
 
 
@@ -101,7 +101,7 @@ def test_the_closest_person_is_the_one_with_those_landmarks(donor):
 
 def test_one_person_gives_a_motion_but_no_expected_error(donor):
     learned = leave_one_out([donor])
-    assert learned.expected is None
+    assert learned.errors_mm == {}
     assert personal_motion([donor], donor.landmarks, learned).weights == {"one": 1.0}
     with pytest.raises(FittingError, match="no subject"):
         leave_one_out([])
