@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from jawusd.base.arrays import Array
 from jawusd.base.errors import EvaluatorError
 from jawusd.evaluator.contact import PREFIXES, check_contact
-from jawusd.evaluator.kinds import KINDS, ArraySpec, arrays_of, optional_of
+from jawusd.evaluator.kinds import KINDS, ArraySpec, present_arrays
 from jawusd.evaluator.speeds import check_speeds
 from jawusd.geometry.anatomy import LANDMARKS
 from jawusd.geometry.se3 import rigidity_defect
@@ -132,9 +132,7 @@ def checked_arrays(arrays: Mapping[str, ArrayLike], kind: str) -> dict[str, Arra
     if kind not in KINDS:
         raise EvaluatorError(f'the model is of kind "{kind}"; this version of jawusd supports {", ".join(KINDS)}.')
     lengths: dict[str, int] = {}
-    specs = arrays_of(kind)
-    for first, group in optional_of(kind).items():
-        specs |= group if first in arrays else {}
+    specs = present_arrays(kind, lambda name, _: name in arrays)
     checked = {name: _checked(name, arrays, spec.shape, lengths) for name, spec in specs.items()}
     _check_values(checked, specs)
     _check_sections(checked)

@@ -10,7 +10,7 @@ import numpy as np
 
 from jawusd.base.arrays import Array
 from jawusd.base.errors import EvaluatorError
-from jawusd.evaluator.curve_formula import catmull_rom, cubic
+from jawusd.evaluator.formula import catmull_rom, cubic
 
 
 @dataclass(frozen=True)

@@ -25,6 +25,7 @@ from jawusd.evaluator.formula import (
     LIMIT_SOFTNESS_MM,
     GaugeNumbers,
 )
+from jawusd.evaluator.operations import FloatOperations
 from jawusd.geometry.rodrigues import N, Triple
 
 INVERSE_TOLERANCE_MM = 1e-13
@@ -44,14 +45,6 @@ class Elementary(NamedTuple, Generic[N]):
     glide: Callable[[object, N, N], Triple[N]]  # (glide table, d2, d3) -> drop [mm], drop_2, drop_3
 
 
-def _clip_float(x: float, low: float, high: float) -> float:
-    return low if x < low else high if x > high else x
-
-
-def _clip_array(x: Array, low: float, high: float) -> Array:
-    return np.minimum(np.maximum(x, low), high)
-
-
 def _glide_floats(table: object, d2: float, d3: float) -> Triple[float]:
     return table.at_floats(d2, d3) if isinstance(table, GlideTable) else (0.0, 0.0, 0.0)
 
@@ -60,28 +53,30 @@ def _glide_arrays(table: object, d2: Array, d3: Array) -> Triple[Array]:
     return table.at_arrays(d2, d3) if isinstance(table, GlideTable) else (np.zeros(1), np.zeros(1), np.zeros(1))
 
 
-FLOATS: Elementary[float] = Elementary(math.sqrt, math.exp, _clip_float, _glide_floats)
-ARRAYS: Elementary[Array] = Elementary(np.sqrt, np.exp, _clip_array, _glide_arrays)
+FLOATS: Elementary[float] = Elementary(math.sqrt, math.exp, FloatOperations.clip, _glide_floats)
+ARRAYS: Elementary[Array] = Elementary(np.sqrt, np.exp, np.clip, _glide_arrays)
 
 
 def path(gauge: GaugeNumbers, d1: N, f: Elementary[N]) -> tuple[N, N, N, N]:
-    """Return gx, gz [mm] and their derivatives gx_1, gz_1 at opening d1 [mm] (Horner's scheme for both)."""
+    """Return gx, gz [mm] and their derivatives gx_1, gz_1 at opening d1 [mm]."""
     scale = gauge.path_scale_mm
     inside = f.clip(d1, gauge.low_mm, gauge.high_mm)
     s, beyond = inside / scale, d1 - inside
-    x1, x2, x3, x4, x5 = gauge.path_x
-    a4 = x5 * s + x4
-    a3 = a4 * s + x3
-    a2 = a3 * s + x2
-    a1 = a2 * s + x1
-    gx_1 = ((((x5 * s + a4) * s + a3) * s + a2) * s + a1) / scale
-    z1, z2, z3, z4, z5 = gauge.path_z
-    b4 = z5 * s + z4
-    b3 = b4 * s + z3
-    b2 = b3 * s + z2
-    b1 = b2 * s + z1
-    gz_1 = ((((z5 * s + b4) * s + b3) * s + b2) * s + b1) / scale
-    return a1 * s + gx_1 * beyond, b1 * s + gz_1 * beyond, gx_1, gz_1
+    x, x_s = path_polynomial(gauge.path_x, s)
+    gx_1 = x_s / scale
+    z, z_s = path_polynomial(gauge.path_z, s)
+    gz_1 = z_s / scale
+    return x * s + gx_1 * beyond, z * s + gz_1 * beyond, gx_1, gz_1
+
+
+def path_polynomial(coefficients: Sequence[float], s: N) -> tuple[N, N]:
+    """Return ``sum_k c_k s^k, k = 1..5`` divided by s, and its derivative, undivided (Horner's scheme)."""
+    c1, c2, c3, c4, c5 = coefficients
+    b4 = c5 * s + c4
+    b3 = b4 * s + c3
+    b2 = b3 * s + c2
+    b1 = b2 * s + c1
+    return b1, (((c5 * s + b4) * s + b3) * s + b2) * s + b1
 
 
 def arch(gauge: GaugeNumbers, d1: N, d2: N, f: Elementary[N]) -> tuple[N, N, N]:

@@ -44,9 +44,8 @@ class RigJudging(RigClearance, RigArrays):
         """
         if bound != "slices":
             rows, batch = as_rows(d, (3,), "d")
-            return -in_chunks(self._polygons(bound).signed_distance, rows).reshape(batch)[
-                ()
-            ]  # a number without batch axes
+            margins = -in_chunks(self._polygons(bound).signed_distance, rows)
+            return margins.reshape(batch)[()]  # a number without batch axes
         d = as_floats(d, "d")
         if d.shape == (3,):
             d1, d2, d3 = d.tolist()

@@ -6,19 +6,23 @@ This file imports only the standard library and modules that do the same: it is 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import ClassVar, Literal, NamedTuple, cast
 
-from jawusd.evaluator.curve_formula import curve, curve_tables, flat_ended_slopes, spline, spread_of
 from jawusd.evaluator.formula import (
     Arrays,
     GaugeNumbers,
     Numbers,
     RigidMotion,
     anchored_motion,
+    curve,
+    curve_tables,
     displacement,
+    flat_ended_slopes,
     glide,
+    spline,
     spline_input,
+    spread_of,
     twist_motion,
 )
 from jawusd.evaluator.operations import FloatOperations, Operations, Table, rows, triple
@@ -225,12 +229,15 @@ def arrays_of(kind: str) -> dict[str, ArraySpec]:
     return {**COMMON, **MODELS[kind].arrays}
 
 
-def optional_of(kind: str) -> dict[str, dict[str, ArraySpec]]:
-    """Return the optional groups of arrays of a model kind, each keyed by the name of one of its arrays."""
-    return {**MODELS[kind].optional, **COMMON_OPTIONAL}
+def present_arrays(kind: str, present: Callable[[str, ArraySpec], bool]) -> dict[str, ArraySpec]:
+    """Return the arrays that a rig of a model kind has, by name, with the optional groups whose key is `present`."""
+    found = arrays_of(kind)
+    for name, group in {**MODELS[kind].optional, **COMMON_OPTIONAL}.items():
+        if present(name, group[name]):
+            found |= group
+    return found
 
 
 def every_array() -> dict[str, ArraySpec]:
     """Return the arrays of all kinds of models, including optional ones, by name."""
-    groups = [group for kind in KINDS for group in (arrays_of(kind), *optional_of(kind).values())]
-    return {name: spec for group in groups for name, spec in group.items()}
+    return {name: spec for kind in KINDS for name, spec in present_arrays(kind, lambda *_: True).items()}

@@ -27,10 +27,9 @@ from jawusd.evaluator.curves import HermiteCurve
 from jawusd.evaluator.gauge import ARRAYS, Gauge, gradient_by_u, spline_input
 from jawusd.evaluator.kinds import ADDITIVE, ANCHORED
 from jawusd.evaluator.motions import (
+    SingleAdditive,
     SingleAnchored,
-    SingleCurve,
     SingleForm,
-    SingleTwist,
     anchored_motions,
     motion_matrix,
     motions_from_twists,
@@ -45,6 +44,7 @@ class JawModelForm(ABC):
     kind: ClassVar[str]
     incisor: Array  # the lower incisal point at rest [mm], shape (3,)
     d_range: Array  # box of d [mm] over which searches start, shape (3, 2)
+    single: SingleForm  # the model for one d, in floats
 
     @abstractmethod
     def arrays(self) -> dict[str, Array]:
@@ -57,15 +57,6 @@ class JawModelForm(ABC):
     @abstractmethod
     def log_jacobian(self, d: Array) -> Array:
         """Return d log M / dd, shape (n, 6, 3)."""
-
-    def log_of_one(self, d1: float, d2: float, d3: float) -> Array:
-        """Return the twist log M(d) of one finite d [mm], shape (6,)."""
-        return self.log(np.array([[d1, d2, d3]]))[0]
-
-    @cached_property
-    def single(self) -> SingleForm:
-        """The model for one d, in floats."""
-        return SingleTwist(self.log_of_one)
 
     @cached_property
     def starts(self) -> StartGrid:
@@ -137,8 +128,7 @@ class AnchoredModel(JawModelForm):
         object.__setattr__(self, "moments", np.ascontiguousarray(moments))
         object.__setattr__(self, "offset", np.zeros(3))
         object.__setattr__(self, "offset", self._spline(np.zeros((1, 3)))[0][0])
-        single = SingleAnchored(self.gauge.numbers, self.incisor, self.scales, self.centres, self.weights, self.offset)
-        object.__setattr__(self, "single", single)
+        object.__setattr__(self, "single", SingleAnchored(self))
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, Array]) -> AnchoredModel:
@@ -255,11 +245,10 @@ class AdditiveModel(JawModelForm):
     curves: tuple[HermiteCurve, HermiteCurve, HermiteCurve]
     incisor: Array  # the incisal point at rest [mm], shape (3,)
     d_range: Array  # box of valid d [mm], shape (3, 2)
-
-    _singles: list[SingleCurve] = field(init=False, repr=False)
+    single: SingleAdditive = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "_singles", [SingleCurve(curve) for curve in self.curves])
+        object.__setattr__(self, "single", SingleAdditive(self.curves))
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, Array]) -> AdditiveModel:
@@ -286,11 +275,6 @@ class AdditiveModel(JawModelForm):
         """Return the twist log M(d), shape (n, 6)."""
         first, second, third = self.curves
         return first.value(d[:, 0]) + second.value(d[:, 1]) + third.value(d[:, 2])
-
-    def log_of_one(self, d1: float, d2: float, d3: float) -> Array:
-        """Return the twist log M(d) of one finite d [mm], shape (6,)."""
-        first, second, third = self._singles
-        return first(d1) + second(d2) + third(d3)
 
     def log_jacobian(self, d: Array) -> Array:
         """Return d log M / dd, shape (n, 6, 3)."""

@@ -8,17 +8,20 @@ then the displacement [mm] of a point p, the anchor: ``u = R p + t - p``.
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Callable
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from jawusd.base.arrays import Array
 from jawusd.evaluator.curves import HermiteCurve
-from jawusd.evaluator.formula import GaugeNumbers
 from jawusd.evaluator.gauge import FLOATS, displacement, gradient_by_u, spline_input
 from jawusd.geometry.rodrigues import Triple, angle_coefficients, apply_series, dot, turning
 from jawusd.geometry.se3 import se3_adjoint, se3_inverse
 from jawusd.geometry.so3 import batched_angle_coefficients
+
+if TYPE_CHECKING:
+    from jawusd.evaluator.models import AnchoredModel
 
 
 def motions_from_twists(twists: Array) -> Array:
@@ -54,24 +57,19 @@ Motion = tuple[float, ...]
 
 
 class SingleAnchored:
-    """A `models.AnchoredModel`, given its arrays, for one finite d or u; the anchor is the incisal point."""
+    """A `models.AnchoredModel` for one finite d or u; the anchor is the incisal point."""
 
-    def __init__(
-        self, gauge: GaugeNumbers, incisor: Array, scales: Array, centres: Array, weights: Array, offset: Array
-    ) -> None:
-        self._gauge = gauge
-        self._scales: Vector = tuple(scales.tolist())
-        self.anchor: Vector = tuple(incisor.tolist())
-        self._offset: Vector = tuple(offset.tolist())
-        count = len(centres)
-        self._linear = weights[count:].tolist()
-        self._kernel = np.ascontiguousarray(weights[:count])
-        # sums over the centres of W_i and of W_i c_i, per output
-        moments = np.concatenate([weights[:count], (weights[:count, :, None] * centres[:, None, :]).reshape(-1, 9)], 1)
-        self._moments = np.ascontiguousarray(moments.T)
+    def __init__(self, model: AnchoredModel) -> None:
+        self._gauge = model.gauge.numbers
+        self._scales: Vector = tuple(model.scales.tolist())
+        self.anchor: Vector = tuple(model.incisor.tolist())
+        self._offset: Vector = tuple(model.offset.tolist())
+        count = len(model.centres)
+        self._linear = model.weights[count:].tolist()
+        self._kernel = np.ascontiguousarray(model.weights[:count])
+        self._moments = np.ascontiguousarray(model.moments[:, :12].T)  # without |c_i|^2
         # |q - c|^2 as one product with (q, |q|^2, 1)
-        squared = np.einsum("ij,ij->i", centres, centres)
-        self._distances = np.column_stack([-2.0 * centres, np.ones(count), squared])
+        self._distances = np.column_stack([-2.0 * model.centres, np.ones(count), model.centres_squared])
 
     def motion(self, d1: float, d2: float, d3: float) -> Motion:
         """Return M(d)."""
@@ -125,38 +123,32 @@ class SingleAnchored:
         ), r
 
 
-class SingleTwist:
-    """A model for one finite d, given log M(d) (6,); the anchor is the origin of the anatomical frame."""
+class SingleAdditive:
+    """A `models.AdditiveModel`, given its curves, for one finite d; the anchor is the origin."""
 
     anchor: Vector = (0.0, 0.0, 0.0)
 
-    def __init__(self, log: Callable[[float, float, float], Array]) -> None:
-        self._log = log
+    def __init__(self, curves: Sequence[HermiteCurve]) -> None:
+        self._curves = [(curve.knots.tolist(), list(curve.coefficients.transpose(0, 2, 1).copy())) for curve in curves]
 
     def motion(self, d1: float, d2: float, d3: float) -> Motion:
         """Return M(d)."""
-        wx, wy, wz, vx, vy, vz = self._log(d1, d2, d3).tolist()
+        first, second, third = (_point(*curve, x) for curve, x in zip(self._curves, (d1, d2, d3)))
+        wx, wy, wz, vx, vy, vz = (first + second + third).tolist()
         omega = wx, wy, wz
         a, b, c = angle_coefficients(wx * wx + wy * wy + wz * wz)
         x, y, z = turning(omega, a, b)
         return *x, *y, *z, *apply_series(omega, (vx, vy, vz), b, c)
 
 
-SingleForm = SingleAnchored | SingleTwist
+SingleForm = SingleAnchored | SingleAdditive
 
 
-class SingleCurve:
-    """A `HermiteCurve` evaluated at one parameter."""
-
-    def __init__(self, curve: HermiteCurve) -> None:
-        self._knots = curve.knots.tolist()
-        self._coefficients = list(curve.coefficients.transpose(0, 2, 1).copy())
-
-    def __call__(self, x: float) -> Array:
-        """Return the point of the curve at x."""
-        interval = bisect_right(self._knots, x)
-        s = x - self._knots[max(interval - 1, 0)]
-        return self._coefficients[interval].dot(np.array((1.0, s, s * s, s * s * s)))
+def _point(knots: list[float], coefficients: list[Array], x: float) -> Array:
+    """Return the point at x of a curve, given its knots and the polynomial coefficients of each interval."""
+    interval = bisect_right(knots, x)
+    s = x - knots[max(interval - 1, 0)]
+    return coefficients[interval].dot(np.array((1.0, s, s * s, s * s * s)))
 
 
 def motion_matrix(motion: Motion, anchor: Vector = (0.0, 0.0, 0.0)) -> Array:

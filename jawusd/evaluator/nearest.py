@@ -1,7 +1,7 @@
 """The search of `jawusd.evaluator.solver` for one problem in floats: faster, and part of the single-file reader.
 
-This file imports only the standard library, `curve_formula`, `formula` and `operations`: it is copied into the reader,
-which runs in Python 3.9. Symmetric matrices are six numbers: xx, xy, xz, yy, yz, zz.
+This file imports only the standard library, `formula` and `operations`: it is copied into the reader, which runs in
+Python 3.9. Symmetric matrices are six numbers: xx, xy, xz, yy, yz, zz.
 """
 
 from __future__ import annotations
@@ -10,8 +10,7 @@ import math
 from collections.abc import Callable
 from typing import NamedTuple
 
-from jawusd.evaluator.curve_formula import curve_derivatives
-from jawusd.evaluator.formula import BoundFormula
+from jawusd.evaluator.formula import BoundFormula, curve_derivatives
 from jawusd.evaluator.operations import FloatOperations, triple
 from jawusd.geometry.rodrigues import Triple, dot
 

@@ -8,7 +8,6 @@ it is copied into the single-file reader.
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
 from bisect import bisect_right
 from collections.abc import Sequence
 from typing import Protocol, TypeVar
@@ -59,41 +58,6 @@ class Operations(Protocol[N, Table]):
 
     def split(self, row: Sequence[N], width: int) -> Sequence[N]:
         """Return a row as `width` separate numbers."""
-
-
-S = TypeVar("S", bound="Symbol")
-
-
-class Symbol(ABC):
-    """A symbolic value of a program under construction: each operator appends an operation to the program."""
-
-    @abstractmethod
-    def operation(self: S, name: str, *operands: S | float) -> S:
-        """Append "Add", "Subtract", "Multiply" or "Divide" of two operands."""
-
-    def __add__(self: S, other: S | float) -> S:
-        return self.operation("Add", self, other)
-
-    def __radd__(self: S, other: float) -> S:
-        return self.operation("Add", other, self)
-
-    def __sub__(self: S, other: S | float) -> S:
-        return self.operation("Subtract", self, other)
-
-    def __rsub__(self: S, other: float) -> S:
-        return self.operation("Subtract", other, self)
-
-    def __mul__(self: S, other: S | float) -> S:
-        return self.operation("Multiply", self, other)
-
-    def __rmul__(self: S, other: float) -> S:
-        return self.operation("Multiply", other, self)
-
-    def __truediv__(self: S, other: S | float) -> S:
-        return self.operation("Divide", self, other)
-
-    def __neg__(self: S) -> S:
-        return self.operation("Multiply", self, -1.0)
 
 
 class FloatOperations:

@@ -12,21 +12,8 @@ from collections.abc import Callable
 import numpy as np
 
 from jawusd.base.arrays import Array, Indices, Mask
+from jawusd.evaluator import nearest
 from jawusd.evaluator.bounds import SliceHull
-from jawusd.evaluator.nearest import (
-    INSIDE_MM,
-    ITERATIONS,
-    MAX_DAMPING,
-    MAX_STEP_MM,
-    MIN_DAMPING,
-    MIN_SLOPE,
-    MIN_STIFFNESS,
-    PULL,
-    PULL_BACKS,
-    START_DAMPING,
-    TOLERANCE_MM,
-    TOUCHING_MM,
-)
 
 # (x (k, 3), row indices (k,)) -> residuals (k, m) and their derivatives with respect to x (k, m, 3)
 Residual = Callable[[Array, Indices], tuple[Array, Array]]
@@ -48,14 +35,14 @@ def minimise(residual: Residual, start: Array, bound: SliceHull | None = None) -
     x[rows[~measured]] = np.nan
     rows = rows[measured]
     r, J = _picked(measured, r, J)
-    damping = np.full(len(rows), START_DAMPING)
+    damping = np.full(len(rows), nearest.START_DAMPING)
     multiplier = np.zeros(len(rows)) if bound is None else _first_multiplier(bound, x[rows], r, J)
-    for _ in range(ITERATIONS):
+    for _ in range(nearest.ITERATIONS):
         if bound is None:
             step = -solve_symmetric(_damped(np.swapaxes(J, 1, 2) @ J, damping), _gradient(J, r))
         else:
             step, multiplier = _bounded_step(bound, x[rows], r, J, damping, multiplier)
-        moving = (np.abs(step) > TOLERANCE_MM).any(axis=1) & (damping < MAX_DAMPING)
+        moving = (np.abs(step) > nearest.TOLERANCE_MM).any(axis=1) & (damping < nearest.MAX_DAMPING)
         if bound is None:
             # the last step doubles the number of correct digits, so it needs no further evaluation
             x[rows] += np.where(moving[:, None], 0.0, step)
@@ -70,7 +57,7 @@ def minimise(residual: Residual, start: Array, bound: SliceHull | None = None) -
         r_trial, J_trial = residual(trial, rows)
         cost_trial = np.einsum("nm,nm->n", r_trial, r_trial)
         better = (cost_trial <= cost[rows]) & allowed
-        damping = np.where(better, np.maximum(damping * 0.1, MIN_DAMPING), damping * 10.0)
+        damping = np.where(better, np.maximum(damping * 0.1, nearest.MIN_DAMPING), damping * 10.0)
         if better.all():
             x[rows], cost[rows], r, J = trial, cost_trial, r_trial, J_trial
         else:
@@ -108,16 +95,16 @@ def _gradient(J: Array, r: Array) -> Array:
 
 def _damped(A: Array, damping: Array) -> Array:
     # damping is relative to the scale of the problem, the same for mm and for weighted residuals
-    amount = damping * (np.einsum("nii->n", A) / 3.0) + MIN_STIFFNESS
+    amount = damping * (np.einsum("nii->n", A) / 3.0) + nearest.MIN_STIFFNESS
     return A + amount[:, None, None] * _IDENTITY
 
 
 def _first_multiplier(bound: SliceHull, x: Array, r: Array, J: Array) -> Array:
     """Return the bound's initial multiplier: computed from the cost gradient where x lies on the bound, otherwise 0."""
     distance, normal = bound.signed_distance_gradient(x)
-    squared = np.maximum(np.einsum("ni,ni->n", normal, normal), MIN_SLOPE)
+    squared = np.maximum(np.einsum("ni,ni->n", normal, normal), nearest.MIN_SLOPE)
     press = -np.einsum("ni,ni->n", normal, _gradient(J, r)) / squared
-    return np.where(distance > -TOUCHING_MM, np.maximum(press, 0.0), 0.0)
+    return np.where(distance > -nearest.TOUCHING_MM, np.maximum(press, 0.0), 0.0)
 
 
 def _bounded_step(
@@ -132,14 +119,14 @@ def _bounded_step(
     multiplier = np.maximum(over, 0.0) / np.einsum("ni,ni->n", normal, inward)
     step -= multiplier[:, None] * inward
     length = np.sqrt(np.einsum("ni,ni->n", step, step))
-    return step * np.minimum(1.0, MAX_STEP_MM / np.maximum(length, 1e-300))[:, None], multiplier
+    return step * np.minimum(1.0, nearest.MAX_STEP_MM / np.maximum(length, 1e-300))[:, None], multiplier
 
 
 def pulled_inside(bound: SliceHull, x: Array) -> tuple[Array, Mask]:
     """Move points x (n, 3) [mm] along the gradient until just inside, in place; return them and which succeeded."""
     inside = np.zeros(len(x), dtype=bool)
     rows: Indices = np.arange(len(x))
-    for _ in range(PULL_BACKS):
+    for _ in range(nearest.PULL_BACKS):
         distance, normal = bound.signed_distance_gradient(x[rows])
         out = distance > 0
         inside[rows[~out]] = True
@@ -147,6 +134,6 @@ def pulled_inside(bound: SliceHull, x: Array) -> tuple[Array, Mask]:
         distance, normal = _picked(out, distance, normal)
         if not rows.size:
             break
-        squared = np.maximum(np.einsum("ni,ni->n", normal, normal), MIN_SLOPE)
-        x[rows] -= ((PULL * distance + INSIDE_MM) / squared)[:, None] * normal
+        squared = np.maximum(np.einsum("ni,ni->n", normal, normal), nearest.MIN_SLOPE)
+        x[rows] -= ((nearest.PULL * distance + nearest.INSIDE_MM) / squared)[:, None] * normal
     return x, inside

@@ -65,8 +65,8 @@ summing = numba.njit(nogil=True, error_model="numpy", fastmath={"reassoc", "cont
 # be addresses in the machine code, which could then not be cached on disk.
 for _function in (
     *(rodrigues.angle_series, rodrigues.angle_quotients, rodrigues.angle_coefficients, rodrigues.cross, rodrigues.dot),
-    *(rodrigues.apply_series, rodrigues.turning, gauge.path, gauge.arch, gauge.drop),
-    *(gauge.fade, gauge.displacement, gauge.opening_equation, gauge.inverse),
+    *(rodrigues.apply_series, rodrigues.turning, gauge.path_polynomial, gauge.path),
+    *(gauge.arch, gauge.drop, gauge.fade, gauge.displacement, gauge.opening_equation, gauge.inverse),
     *(gauge.spline_input, gauge.gradient_by_u),
 ):
     register_jitable(forceinline=True, nogil=True, error_model="numpy")(_function)

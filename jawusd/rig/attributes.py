@@ -21,7 +21,7 @@ from pxr import Sdf, Usd
 from jawusd.base.arrays import Array, Mask
 from jawusd.base.errors import FormatError, VersionError
 from jawusd.evaluator import JawRig
-from jawusd.evaluator.kinds import D_RANGE_ATTRIBUTES, ArraySpec, arrays_of, optional_of
+from jawusd.evaluator.kinds import D_RANGE_ATTRIBUTES, present_arrays
 from jawusd.rig import layers
 from jawusd.rig.layers import set_attribute
 from jawusd.rig.layout import FORMAT_VERSION
@@ -38,10 +38,7 @@ MAX_VALUES = 30_000_000
 
 def write_arrays(prim: Sdf.PrimSpec, rig: JawRig, prefixes: tuple[str, ...]) -> None:
     """Write the model arrays whose attribute names start with one of the prefixes."""
-    optional = {
-        name: spec for group in optional_of(rig.kind).values() for name, spec in group.items() if name in rig.arrays
-    }
-    for name, spec in {**arrays_of(rig.kind), **optional}.items():
+    for name, spec in present_arrays(rig.kind, lambda name, _: name in rig.arrays).items():
         if spec.attribute is None or not spec.attribute.startswith(prefixes):
             continue
         value = rig.arrays[name]
@@ -61,7 +58,8 @@ def read_arrays(prim: Usd.Prim, kind: str, where: object) -> dict[str, Array]:
     """
     arrays: dict[str, Array] = {}
     lengths: dict[str, int] = {}
-    for name, spec in {**arrays_of(kind), **_optional_arrays(prim, kind)}.items():
+    authored = present_arrays(kind, lambda _, spec: prim.GetAttribute(spec.attribute or "").HasAuthoredValue())
+    for name, spec in authored.items():
         if spec.attribute is None:
             ranges = [read_value(prim, attribute, where) for attribute in D_RANGE_ATTRIBUTES]
             arrays[name] = np.array(ranges, dtype=np.float64)
@@ -78,14 +76,6 @@ def read_arrays(prim: Usd.Prim, kind: str, where: object) -> dict[str, Array]:
             raise FormatError(message, path=str(where)) from error
         lengths.update((n, found) for n, found in zip(spec.shape, arrays[name].shape) if isinstance(n, str))
     return arrays
-
-
-def _optional_arrays(prim: Usd.Prim, kind: str) -> dict[str, ArraySpec]:
-    found: dict[str, ArraySpec] = {}
-    for first, group in optional_of(kind).items():
-        if prim.GetAttribute(group[first].attribute or "").HasAuthoredValue():
-            found |= group
-    return found
 
 
 def read_value(prim: Usd.Prim, name: str, where: object) -> object:

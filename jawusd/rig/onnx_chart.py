@@ -16,7 +16,7 @@ from onnx import TensorProto, helper
 from jawusd.base.arrays import Array
 from jawusd.evaluator import JawRig
 from jawusd.evaluator.arrays import flat_arrays
-from jawusd.evaluator.curve_formula import curve_derivatives
+from jawusd.evaluator.formula import curve_derivatives
 from jawusd.evaluator.gauge import (
     INVERSE_ITERATIONS,
     INVERSE_STEP_MM,

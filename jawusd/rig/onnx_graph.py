@@ -13,7 +13,7 @@ from onnx import TensorProto, helper, numpy_helper
 
 from jawusd.base.arrays import Array
 from jawusd.evaluator.formula import long_angle_series
-from jawusd.evaluator.operations import Symbol, triple
+from jawusd.evaluator.operations import triple
 from jawusd.geometry.rodrigues import Triple, angle_quotients
 
 # absolute Bernoulli numbers |B_2k|, k = 1..8, in the series of the inverse left Jacobian
@@ -22,21 +22,39 @@ _INVERSE_SERIES = [number / factorial(2 * k) for k, number in enumerate(_BERNOUL
 # Squared angle below which the closed forms suffer from cancellation in float32; above, the series is inaccurate.
 _SERIES_BELOW_RAD2 = 0.25
 
-_ARITHMETIC = {"Add": "Add", "Subtract": "Sub", "Multiply": "Mul", "Divide": "Div"}
-
 FloatType = type[np.float32] | type[np.float64]
 
 
 @dataclass(frozen=True)
-class Value(Symbol):
+class Value:
     """A value in a graph: a column (n, 1), or an array of m columns (n, m); see `jawusd.evaluator.operations`."""
 
     graph: Graph = field(repr=False)
     name: str
 
-    def operation(self, name: str, *operands: Value | float) -> Value:
-        """Add an arithmetic operator."""
-        return self.graph.op(_ARITHMETIC[name], *operands)
+    def __add__(self, other: Value | float) -> Value:
+        return self.graph.op("Add", self, other)
+
+    def __radd__(self, other: float) -> Value:
+        return self.graph.op("Add", other, self)
+
+    def __sub__(self, other: Value | float) -> Value:
+        return self.graph.op("Sub", self, other)
+
+    def __rsub__(self, other: float) -> Value:
+        return self.graph.op("Sub", other, self)
+
+    def __mul__(self, other: Value | float) -> Value:
+        return self.graph.op("Mul", self, other)
+
+    def __rmul__(self, other: float) -> Value:
+        return self.graph.op("Mul", other, self)
+
+    def __truediv__(self, other: Value | float) -> Value:
+        return self.graph.op("Div", self, other)
+
+    def __neg__(self) -> Value:
+        return self.graph.op("Mul", self, -1.0)
 
     def __matmul__(self, matrix: ArrayLike) -> Value:
         """Return rows (n, k) times a constant matrix (k, m)."""

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from jawusd.base.arrays import Array
-from jawusd.evaluator.curve_formula import curve_derivatives, spline
+from jawusd.evaluator.formula import curve_derivatives, spline
 from jawusd.evaluator.gauge import (
     INVERSE_ITERATIONS,
     INVERSE_STEP_MM,

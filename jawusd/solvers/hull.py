@@ -11,21 +11,10 @@ from torch import Tensor
 
 from jawusd.base.arrays import Array
 from jawusd.base.errors import EvaluatorError
+from jawusd.evaluator import nearest as limits
 from jawusd.evaluator.arrays import flat_arrays
 from jawusd.evaluator.bounds import SliceHull
-from jawusd.evaluator.curve_formula import curve, curve_derivatives
-from jawusd.evaluator.formula import BoundFormula
-from jawusd.evaluator.nearest import (
-    INSIDE_MM,
-    ITERATIONS,
-    MAX_DAMPING,
-    MAX_STEP_MM,
-    MIN_DAMPING,
-    MIN_SLOPE,
-    PULL,
-    PULL_BACKS,
-    TOLERANCE_MM,
-)
+from jawusd.evaluator.formula import BoundFormula, curve, curve_derivatives
 from jawusd.evaluator.operations import triple
 from jawusd.solvers.motion import OPERATIONS, Formula
 from jawusd.solvers.solution import applied, capturing, finished, inverse
@@ -170,7 +159,7 @@ class Hull(Formula):
                 state, _ = self._stepped(*state)
             return state[1]
         found, rows = start.clone(), torch.arange(start.shape[0], device=start.device)
-        for _ in range(ITERATIONS):
+        for _ in range(limits.ITERATIONS):
             state, moving = self._stepped(*state)
             found[rows] = state[1]
             rows, state = rows[moving], [values[moving] for values in state]
@@ -182,22 +171,22 @@ class Hull(Formula):
         self, wanted: Tensor, x: Tensor, cost: Tensor, damping: Tensor, multiplier: Tensor
     ) -> tuple[list[Tensor], Tensor]:
         """Return the state of the searches after one step, and which of them (n,) were still moving."""
-        tolerance_mm = TOLERANCE_MM if wanted.dtype == torch.float64 else 1e-4
+        tolerance_mm = limits.TOLERANCE_MM if wanted.dtype == torch.float64 else 1e-4
         identity = torch.eye(3, dtype=x.dtype, device=x.device)
         at = self.expansion(x)
         A = identity * (1.0 + damping)[:, None, None] + multiplier[:, None, None] * at.rounding
         to_bottom = inverse(A)
         step, inward = applied(to_bottom, wanted - x), applied(to_bottom, at.gradient)
         over = at.distance + (at.gradient * step).sum(dim=1)
-        multiplier = over.clamp(min=0.0) / (at.gradient * inward).sum(dim=1).clamp(min=MIN_SLOPE)
+        multiplier = over.clamp(min=0.0) / (at.gradient * inward).sum(dim=1).clamp(min=limits.MIN_SLOPE)
         step = step - multiplier[:, None] * inward
         length = step.square().sum(dim=1, keepdim=True).sqrt().clamp(min=1e-30)
-        moving = (length[:, 0] > tolerance_mm) & (damping < MAX_DAMPING)
-        trial = self._pulled_inside(x + step * (MAX_STEP_MM / length).clamp(max=1.0))
+        moving = (length[:, 0] > tolerance_mm) & (damping < limits.MAX_DAMPING)
+        trial = self._pulled_inside(x + step * (limits.MAX_STEP_MM / length).clamp(max=1.0))
         nearer = (trial - wanted).square().sum(dim=1)
         taken = (nearer <= cost) & (self.margin(trial) >= 0)
         x, cost = torch.where(taken[:, None], trial, x), torch.where(taken, nearer, cost)
-        damping = torch.where(taken, (damping * 0.1).clamp(min=MIN_DAMPING), damping * 10.0)
+        damping = torch.where(taken, (damping * 0.1).clamp(min=limits.MIN_DAMPING), damping * 10.0)
         return [wanted, x, cost, damping, multiplier], moving
 
     def _polished(self, wanted: Tensor, x: Tensor) -> Tensor:
@@ -214,21 +203,22 @@ class Hull(Formula):
     def _conditions(self, wanted: Tensor, x: Tensor) -> tuple[Tensor, Tensor, Expansion]:
         """Return the Jacobian (n, 3, 3) of ``x - wanted + multiplier gradient``, the multiplier and the hull at x."""
         at = self.expansion(x)
-        squared = at.gradient.square().sum(dim=1).clamp(min=MIN_SLOPE)
+        squared = at.gradient.square().sum(dim=1).clamp(min=limits.MIN_SLOPE)
         multiplier = ((wanted - x) * at.gradient).sum(dim=1) / squared
         identity = torch.eye(3, dtype=x.dtype, device=x.device)
         return identity + multiplier[:, None, None] * (at.rounding + at.bending), multiplier, at
 
     def _pulled_inside(self, x: Tensor) -> Tensor:
         # deep enough that rounding of the margin cannot put the point outside again
-        depth_mm = INSIDE_MM if x.dtype == torch.float64 else 1e-5
-        for _ in range(_PULLS_CAPTURED if capturing() else PULL_BACKS):
+        depth_mm = limits.INSIDE_MM if x.dtype == torch.float64 else 1e-5
+        for _ in range(_PULLS_CAPTURED if capturing() else limits.PULL_BACKS):
             distance, gradient = self.slope(x)
             out = distance + 0.5 * depth_mm
             if finished(out > 0):
                 break
-            squared = gradient.square().sum(dim=1).clamp(min=MIN_SLOPE)
-            pull = torch.where(out > 0, PULL * distance.clamp(min=0.0) + depth_mm, torch.zeros_like(out)) / squared
+            squared = gradient.square().sum(dim=1).clamp(min=limits.MIN_SLOPE)
+            amount = limits.PULL * distance.clamp(min=0.0) + depth_mm
+            pull = torch.where(out > 0, amount, torch.zeros_like(out)) / squared
             x = x - pull[:, None] * gradient
         return x
 

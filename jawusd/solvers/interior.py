@@ -11,8 +11,8 @@ from torch import Tensor
 from jawusd.base.arrays import Array, Mask
 from jawusd.base.errors import EvaluatorError
 from jawusd.evaluator.bounds import SliceHull
-from jawusd.evaluator.curve_formula import curve_derivatives, curve_tables
 from jawusd.evaluator.curves import HermiteCurve, flat_ended
+from jawusd.evaluator.formula import curve_derivatives, curve_tables
 from jawusd.solvers.hull import Hull
 from jawusd.solvers.motion import OPERATIONS, Formula
 from jawusd.solvers.solution import capturing, finished
