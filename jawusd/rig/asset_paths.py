@@ -78,18 +78,21 @@ def asset_paths(layer: Sdf.Layer) -> list[str]:
 
 def clip_templates(layer: Sdf.Layer) -> list[str]:
     """Return the value clip templates of a layer: asset paths with # in place of digits."""
-    found: list[str] = []
+    specs = [spec for path in paths_in(layer) if (spec := prim_spec_at(layer, path)) and spec.HasInfo("clips")]
+    sets = [values for spec in specs for values in spec.GetInfo("clips").values() if isinstance(values, dict)]
+    return [_evaluated_text(layer, str(each["templateAssetPath"])) for each in sets if "templateAssetPath" in each]
 
-    def visit(path: Sdf.Path) -> None:
-        spec = layer.GetPrimAtPath(path) if path.IsPrimPath() or path.IsPrimVariantSelectionPath() else None
-        clips = spec.GetInfo("clips") if spec and spec.HasInfo("clips") else {}
-        sets = [values for values in clips.values() if isinstance(values, dict)]
-        found.extend(
-            _evaluated_text(layer, str(values["templateAssetPath"])) for values in sets if "templateAssetPath" in values
-        )
 
-    layer.Traverse(Sdf.Path.absoluteRootPath, visit)
+def paths_in(layer: Sdf.Layer) -> list[Sdf.Path]:
+    """Return the paths of everything in a layer, those inside variants included."""
+    found: list[Sdf.Path] = []
+    layer.Traverse(Sdf.Path.absoluteRootPath, found.append)
     return found
+
+
+def prim_spec_at(layer: Sdf.Layer, path: Sdf.Path) -> Sdf.PrimSpec | None:
+    """Return the spec of a prim or of a variant; None for other paths."""
+    return layer.GetPrimAtPath(path) if path.IsPrimPath() or path.IsPrimVariantSelectionPath() else None
 
 
 def _evaluated_text(layer: Sdf.Layer, text: str) -> str:

@@ -17,7 +17,7 @@ from jawusd.base.errors import RigError
 from jawusd.base.inputs import check_input, is_allowed
 from jawusd.formats.atomic import atomic_path, scratch_folder
 from jawusd.rig import layers, layout
-from jawusd.rig.asset_paths import CHECKSUMS, record_checksums
+from jawusd.rig.asset_paths import CHECKSUMS, paths_in, record_checksums
 from jawusd.rig.read import describe, open_stage
 
 _ZIP_EPOCH = 315_619_200  # fixed file time in packages [s since 1970], the earliest in a zip of any time zone
@@ -80,10 +80,8 @@ def _rigs_in(layer: Sdf.Layer) -> list[Sdf.Path]:
 
 def _avoid_integers(layer: Sdf.Layer) -> None:
     """Offset integer-valued transforms by `_OFFSET` or, in single precision, to the next representable number."""
-    found: list[Sdf.Path] = []
-    layer.Traverse(Sdf.Path.absoluteRootPath, lambda path: found.append(path) if _OP in path.name else None)
-    for path in found:
-        attribute = layer.GetAttributeAtPath(path)
+    for path in paths_in(layer):
+        attribute = layer.GetAttributeAtPath(path) if _OP in path.name else None
         if attribute is None:
             continue
         if attribute.default is not None:

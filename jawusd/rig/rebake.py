@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -16,6 +15,7 @@ from jawusd.base.arrays import Array
 from jawusd.base.errors import FormatError, RigError
 from jawusd.evaluator import JawRig
 from jawusd.rig.animation import author_motion, note_unseen
+from jawusd.rig.asset_paths import paths_in, prim_spec_at
 from jawusd.rig.attributes import key_times
 from jawusd.rig.layers import new_layer, relative_path, set_attribute, write_layer
 from jawusd.rig.layout import MOTION, PARAMETERS, SKELETON, TRANSFORMS, rig_prims
@@ -299,24 +299,18 @@ def _check_moves(layer: Sdf.Layer, prims: list[str], motions: Sequence[Rebaked],
 
 def _overridden_by_root(stage: Usd.Stage, layer: Sdf.Layer) -> list[str]:
     """Return the paths of a layer's attributes and prims on which the root layer of a stage has other opinions."""
-    found: list[str] = []
     root = stage.GetRootLayer()
 
-    def visit(path: Sdf.Path) -> None:
-        if path.IsPrimPropertyPath() and root.GetAttributeAtPath(path):
-            times, attribute = layer.ListTimeSamplesForPath(path), stage.GetAttributeAtPath(path)
-            same = not times and root.GetAttributeAtPath(path).default == layer.GetAttributeAtPath(path).default
-            if path.name in PARAMETERS:  # unchanged keys of d are no conflict
-                now, then = (
-                    [value(time) for time in times] for value in (attribute.Get, partial(layer.QueryTimeSample, path))
-                )
-                same = np.allclose(now, then, rtol=0, atol=_SAME_MM)
-            if not same:
-                found.append(str(path))
-        elif path.IsPrimPath() and (own := root.GetPrimAtPath(path)):
-            over = layer.GetPrimAtPath(path)
-            if any(over.HasInfo(name) and own.HasInfo(name) for name in ("variantSelection", "instanceable")):
-                found.append(str(path))
+    def overridden(path: Sdf.Path) -> bool:
+        if path.IsPrimPropertyPath() and (own := root.GetAttributeAtPath(path)):
+            times = layer.ListTimeSamplesForPath(path)
+            if path.name not in PARAMETERS:
+                return bool(times) or own.default != layer.GetAttributeAtPath(path).default
+            now = [stage.GetAttributeAtPath(path).Get(time) for time in times]
+            then = [layer.QueryTimeSample(path, time) for time in times]
+            return not np.allclose(now, then, rtol=0, atol=_SAME_MM)  # unchanged keys of d are no conflict
+        over, own = prim_spec_at(layer, path), root.GetPrimAtPath(path)
+        named = ("variantSelection", "instanceable")
+        return over is not None and bool(own) and any(over.HasInfo(name) and own.HasInfo(name) for name in named)
 
-    layer.Traverse(Sdf.Path.absoluteRootPath, visit)
-    return found
+    return [str(path) for path in paths_in(layer) if overridden(path)]

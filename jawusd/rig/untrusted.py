@@ -21,6 +21,8 @@ from jawusd.rig.asset_paths import (
     file_of_layer,
     files_of_template,
     is_layer,
+    paths_in,
+    prim_spec_at,
     recorded_checksums,
     target_of,
     with_variables,
@@ -247,15 +249,11 @@ def _is_intact(layer: Sdf.Layer) -> bool:
 
 
 def _is_rig_layer(layer: Sdf.Layer) -> bool:
-    found = []
-
-    def visit(path: Sdf.Path) -> None:
-        if path.IsPropertyPath():
-            found.append(path.name.startswith(_RIG_ATTRIBUTES))
-        elif path.IsPrimPath() or path.IsPrimVariantSelectionPath():
-            spec = layer.GetPrimAtPath(path)
-            schemas = spec.GetInfo("apiSchemas") if spec else None
-            found.append(schemas is not None and SCHEMA_NAME in schemas.GetAddedOrExplicitItems())
-
-    layer.Traverse(Sdf.Path.absoluteRootPath, visit)
-    return any(found)
+    for path in paths_in(layer):
+        if path.IsPropertyPath() and path.name.startswith(_RIG_ATTRIBUTES):
+            return True
+        spec = prim_spec_at(layer, path)
+        schemas = spec.GetInfo("apiSchemas") if spec else None
+        if schemas is not None and SCHEMA_NAME in schemas.GetAddedOrExplicitItems():
+            return True
+    return False
