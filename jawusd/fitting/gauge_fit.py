@@ -101,14 +101,14 @@ def fit_gauge(u: Array, weights: Array, path: Gauge, shown: Mask) -> GaugeFit:
         for _ in range(_ROUNDS):  # alternate between inverting the gauge for d, and fitting its parts to d
             gauge = _with_arch(gauge, u, weights, shown, stiffness)
             gauge = _with_drop(gauge, u, weights, shown, stiffness)
-        minor = _smallest_minor_around(gauge, u)
+        minor = smallest_minor_around(gauge, gauge.inverse(u))
         if minor >= SMALLEST_MINOR:
             return GaugeFit(gauge, minor, float(stiffness))
-    return GaugeFit(path, _smallest_minor_around(path, u), None)
+    return GaugeFit(path, smallest_minor_around(path, path.inverse(u)), None)
 
 
-def _smallest_minor_around(gauge: Gauge, u: Array) -> float:
-    d = gauge.inverse(u)
+def smallest_minor_around(gauge: Gauge, d: Array) -> float:
+    """Return `smallest_minor` over the box of parameters (N, 3) [mm] with a margin; -inf if some are not finite."""
     if not np.isfinite(d).all():
         return -np.inf
     return smallest_minor(gauge, np.stack([d.min(0) - _WIDER_MM, d.max(0) + _WIDER_MM], axis=1))

@@ -21,7 +21,7 @@ from jawusd.evaluator.gauge import Gauge
 from jawusd.evaluator.models import AnchoredModel
 from jawusd.fitting.bounds import fit_bounds
 from jawusd.fitting.data import ranges_of
-from jawusd.fitting.gauge_fit import SMALLEST_MINOR, smallest_minor
+from jawusd.fitting.gauge_fit import SMALLEST_MINOR, smallest_minor_around
 from jawusd.formats.model import JawModel
 from jawusd.geometry.se3 import make_transform
 from jawusd.meshes.contact import Teeth
@@ -36,7 +36,6 @@ _REST_MM = 2.0  # radius around the closed bite [mm], the bottom of the fossae, 
 # Maximum slopes along d2 and d3, in the order tried; steeper surfaces follow deep fossae more closely.
 _SLOPES = ((1.5, 1.0), (1.0, 0.7), (0.6, 0.4))
 _RANK_ERROR_MM = 0.03
-_GAUGE_ROOM_MM = 3.0  # margin around the captured parameters within which the gauge must be invertible [mm]
 
 
 def follow_teeth(model: JawModel, teeth: Teeth) -> JawModel:
@@ -53,10 +52,7 @@ def follow_teeth(model: JawModel, teeth: Teeth) -> JawModel:
     for slopes in _SLOPES:
         gauge = replace(form.gauge, glide_drop=np.zeros(4), glide=_factored(d2, d3, _hull(d2, d3, down, slopes)))
         d = _carried(form.gauge, gauge, model.d)
-        if not np.isfinite(d[known]).all():
-            continue
-        box = np.stack([d[known].min(axis=0) - _GAUGE_ROOM_MM, d[known].max(axis=0) + _GAUGE_ROOM_MM], axis=1)
-        if smallest_minor(gauge, box) > SMALLEST_MINOR:
+        if smallest_minor_around(gauge, d[known]) > SMALLEST_MINOR:
             return _regauged(model, form.gauge, gauge, d)
     return model
 
