@@ -95,19 +95,16 @@ def write_animation(
     layer = new_layer(fps)
     layer.subLayerPaths.append(relative_path(actor, out))
     layer.startTimeCode, layer.endTimeCode = float(frames[0]), float(frames[-1])
-    note_unseen(layer, carried, by_skin)
-    if not known.all():
-        lost = layers.int_array(np.floor(frames[~known]))
-        layer.customLayerData = {**layer.customLayerData, LOST: lost}
+    note_unseen(layer, carried, by_skin, frames[~known])
     author_motion(layer, rig, frames[known], d[known], frames[[0, -1]])
     if paths := list(skinned):
         add_skeleton_variant(layer, rig, paths)
     return write_layer(rename_actor(layer, root_prim_of(actor)), out)
 
 
-def note_unseen(layer: Sdf.Layer, carried: ArrayLike, by_skin: ArrayLike) -> None:
+def note_unseen(layer: Sdf.Layer, carried: ArrayLike, by_skin: ArrayLike, lost: ArrayLike = ()) -> None:
     """Write the frames (F,) whose d was not measured to the layer's `customLayerData`; see `write_animation`."""
-    for key, frames in ((CARRIED, carried), (SKIN, by_skin)):
+    for key, frames in ((CARRIED, carried), (SKIN, by_skin), (LOST, lost)):
         if len(np.atleast_1d(frames)):
             layer.customLayerData = {**layer.customLayerData, key: layers.int_array(np.floor(np.asarray(frames)))}
 

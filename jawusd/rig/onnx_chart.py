@@ -76,9 +76,9 @@ class AnchoredChart:
         constant[1, 0], constant[0, 1], constant[2, 2] = -1.0 / scales[0], 1.0 / scales[1], 1.0 / scales[2]
         q_x = g.concat(slopes) @ by_slope.reshape(2, 9) + g.constant(constant.reshape(1, 9))
         omega_x = g.op("MatMul", g.reshape(q_x, [-1, 3, 3]), omega_q)
-        turning = _Turning.of(g, omega)
-        w = g.op("MatMul", omega_x, turning.left_transposed(g))
-        return ChartMotion(turning.rotation(g), g.reshape(x, [-1, 1, 3]), w, g.constant(np.eye(3)[None]))
+        turning = _Turning(g, omega)
+        w = g.op("MatMul", omega_x, turning.left_transposed())
+        return ChartMotion(turning.rotation(), g.reshape(x, [-1, 1, 3]), w, g.constant(np.eye(3)[None]))
 
     def parameters(self, g: Graph, x: Value) -> Value:
         """Return d by a search in the opening d1 alone, as `jawusd.evaluator.gauge.Gauge.inverse` does."""
@@ -214,12 +214,12 @@ class AdditiveChart(ParameterChart):
         omega, v = g.parts(first + second + third, 2)
         slopes = g.reshape(g.concat([slope for _, (slope,), _ in curves]), [-1, 3, 6])
         omega_x, v_x = g.parts(slopes, 2, axis=2)
-        turning = _Turning.of(g, omega)
-        left = turning.left_transposed(g)
+        turning = _Turning(g, omega)
+        left = turning.left_transposed()
         row = g.reshape(v, [-1, 1, 3])
-        along = g.op("MatMul", omega_x, turning.left_change_transposed(g, v))
+        along = g.op("MatMul", omega_x, turning.left_change_transposed(v))
         shift_x = g.op("MatMul", v_x, left) + along
-        return ChartMotion(turning.rotation(g), g.op("MatMul", row, left), g.op("MatMul", omega_x, left), shift_x)
+        return ChartMotion(turning.rotation(), g.op("MatMul", row, left), g.op("MatMul", omega_x, left), shift_x)
 
 
 Chart = AnchoredChart | ParameterChart
@@ -227,55 +227,47 @@ Chart = AnchoredChart | ParameterChart
 CHARTS: dict[str, Callable[[JawRig], Chart]] = {ANCHORED: AnchoredChart, ADDITIVE: AdditiveChart}
 
 
-@dataclass(frozen=True)
 class _Turning:
-    """Powers of the skew matrix W of rotation vectors, and the coefficients of Rodrigues' formula."""
+    """Powers of the skew matrix W (n, 9) of rotation vectors, and the coefficients a, b, c of Rodrigues' formula."""
 
-    omega: Value  # rotation vectors [rad], shape (n, 3)
-    squared: Value  # their squared lengths [rad^2], shape (n, 1)
-    W: Value  # the skew matrix, shape (n, 9)
-    WW: Value  # its square, shape (n, 9)
-    coefficients: Triple[Value]  # a, b and c of `jawusd.geometry.rodrigues`, shape (n, 1) each
-
-    @classmethod
-    def of(cls, g: Graph, omega: Value) -> _Turning:
+    def __init__(self, g: Graph, omega: Value) -> None:
         """Compute the powers and coefficients for rotation vectors (n, 3) [rad]."""
-        W, squared = omega @ _HAT, g.sum_columns(omega * omega)
-        matrix = g.reshape(W, [-1, 3, 3])
-        WW = g.reshape(g.op("MatMul", matrix, matrix), [-1, 9])
-        return cls(omega, squared, W, WW, g.angle_coefficients(squared))
+        self._g, self._omega = g, omega
+        self._W, self._squared = omega @ _HAT, g.sum_columns(omega * omega)
+        matrix = g.reshape(self._W, [-1, 3, 3])
+        self._WW = g.reshape(g.op("MatMul", matrix, matrix), [-1, 9])
+        self._coefficients = g.angle_coefficients(self._squared)
 
-    def rotation(self, g: Graph) -> Value:
+    def rotation(self) -> Value:
         """Return the rotation matrix, shape (n, 3, 3)."""
-        a, b, _ = self.coefficients
-        return self._matrix(g, self.W * a + self.WW * b)
+        a, b, _ = self._coefficients
+        return self._matrix(self._W * a + self._WW * b)
 
-    def left_transposed(self, g: Graph) -> Value:
+    def left_transposed(self) -> Value:
         """Return the transposed left Jacobian, shape (n, 3, 3)."""
-        _, b, c = self.coefficients
-        return self._matrix(g, self.WW * c - self.W * b)  # W is antisymmetric, W W symmetric
+        _, b, c = self._coefficients
+        return self._matrix(self._WW * c - self._W * b)  # W is antisymmetric, W W symmetric
 
-    def left_change_transposed(self, g: Graph, v: Value) -> Value:
+    def left_change_transposed(self, v: Value) -> Value:
         """Return the transposed derivative of the left Jacobian times v (n, 3), with respect to omega, (n, 3, 3).
 
         It is ``2 (b' W v + c' W W v) omega^T - b [v] - c (W [v] + [W v])``, where [v] is the skew matrix of v, and b'
         and c' are derivatives with respect to the squared angle.
         """
-        _, b, c = self.coefficients
-        b_x, c_x = g.angle_slopes(self.squared, self.coefficients)
-        W = g.reshape(self.W, [-1, 3, 3])
+        g, (_, b, c) = self._g, self._coefficients
+        b_x, c_x = g.angle_slopes(self._squared, self._coefficients)
+        W = g.reshape(self._W, [-1, 3, 3])
         skew = v @ _HAT
         once = g.reshape(g.op("MatMul", W, g.reshape(v, [-1, 3, 1])), [-1, 3])
         twice = g.reshape(g.op("MatMul", W, g.reshape(once, [-1, 3, 1])), [-1, 3])
         along = 2.0 * (once * b_x + twice * c_x)
-        outer = g.op("MatMul", g.reshape(self.omega, [-1, 3, 1]), g.reshape(along, [-1, 1, 3]))
+        outer = g.op("MatMul", g.reshape(self._omega, [-1, 3, 1]), g.reshape(along, [-1, 1, 3]))
         # [v]^T = -[v], and (W [v])^T = [v] W
         product = g.reshape(g.op("MatMul", g.reshape(skew, [-1, 3, 3]), W), [-1, 9])
         return outer + g.reshape(skew * b + (once @ _HAT - product) * c, [-1, 3, 3])
 
-    @staticmethod
-    def _matrix(g: Graph, flat: Value) -> Value:
-        return g.reshape(flat + g.constant(np.eye(3).reshape(1, 9)), [-1, 3, 3])
+    def _matrix(self, flat: Value) -> Value:
+        return self._g.reshape(flat + self._g.constant(np.eye(3).reshape(1, 9)), [-1, 3, 3])
 
 
 def moved_vectors(g: Graph, w: Value, vectors: Value) -> Value:

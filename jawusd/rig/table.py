@@ -8,7 +8,7 @@ Splines, chapter XII).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -181,15 +181,13 @@ def build_table(rig: JawRig, vertices: Array, size: int = DEFAULT_SIZE) -> Decod
     axes = grid_axes(rig, valid_box(rig), vertices[extreme_vertices(vertices)], size)
     if rig.kind == ADDITIVE:
         twists = np.concatenate([rig.twist(np.outer(axis, np.eye(3)[i])) for i, axis in enumerate(axes)])
-        table = DecoderTable("curves", axes, twists.astype(np.float32))
     else:
         twists = _balanced_twists(rig, axes)
-        table = DecoderTable("grid", axes, twists.astype(np.float32))
+    table = DecoderTable("curves" if rig.kind == ADDITIVE else "grid", axes, twists.astype(np.float32))
     # the error of linear interpolation is largest in the middle of the cells
     middles = grid_points([0.5 * (axis[1:] + axis[:-1]) for axis in axes])
     samples = np.concatenate([middles[rig.margin(middles) >= 0], sample_valid(rig, _VALID_SAMPLES)])
-    error = table_error(rig, table, vertices, samples)
-    return DecoderTable(table.format, table.axes, table.twists, error, len(samples))
+    return replace(table, max_error_mm=table_error(rig, table, vertices, samples), error_samples=len(samples))
 
 
 def _balanced_twists(rig: JawRig, axes: tuple[Array, Array, Array]) -> Array:
