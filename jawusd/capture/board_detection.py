@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -14,6 +13,7 @@ from numpy.typing import NDArray
 from jawusd.base.arrays import Array
 from jawusd.base.errors import CalibrationError, CaptureError
 from jawusd.formats.capture import Boards
+from jawusd.formats.capture_writing import BoardSketch
 from jawusd.formats.file_names import is_pattern, numbered_files
 from jawusd.media.pictures import read_gray, read_header, read_stored
 from jawusd.media.pixels import to_display
@@ -77,18 +77,11 @@ def _common_chessboard(images: Sequence[NDArray[np.uint8]]) -> tuple[tuple[int, 
     return sizes.most_common(1)[0] if sizes else ((0, 0), 0)
 
 
-@dataclass(frozen=True)
-class DetectedBoard:
-    """Calibration board found in clips: number of inner corners of a chessboard, or the marker dictionary."""
+def detect_board(pictures: Iterable[NDArray[np.uint8]]) -> BoardSketch | None:
+    """Return the board found in the largest number of gray images (h, w), or None if no two images agree.
 
-    pattern: str
-    cols: int | None = None
-    rows: int | None = None
-    dictionary: str | None = None
-
-
-def detect_board(pictures: Iterable[NDArray[np.uint8]]) -> DetectedBoard | None:
-    """Return the board found in the largest number of gray images (h, w), or None if no two images agree."""
+    A chessboard has its numbers of inner corners, and a ChArUco board its dictionary of markers.
+    """
     markers: Counter[str] = Counter()
     highest: dict[str, int] = {}
     small = [_reduced(picture) for picture in pictures]
@@ -99,9 +92,9 @@ def detect_board(pictures: Iterable[NDArray[np.uint8]]) -> DetectedBoard | None:
     family, times = markers.most_common(1)[0] if markers else ("", 0)
     if times >= _TIMES:
         size = next(size for size in _SIZES if size > highest[family])
-        return DetectedBoard("charuco", dictionary=f"DICT_{family}_{size}")
+        return BoardSketch("charuco", dictionary=f"DICT_{family}_{size}")
     (cols, rows), times = _common_chessboard(small)
-    return DetectedBoard("chessboard", cols, rows) if times >= _TIMES else None
+    return BoardSketch("chessboard", cols, rows) if times >= _TIMES else None
 
 
 def _reduced(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:

@@ -17,7 +17,7 @@ from scipy.sparse import csr_matrix
 
 from jawusd.base.arrays import Array
 from jawusd.base.errors import CalibrationError
-from jawusd.capture.initial_guess import InitialGuess
+from jawusd.capture.initial_guess import BoardCameras
 from jawusd.geometry import hat, make_transform, so3_exp, so3_left_jacobian, so3_log
 from jawusd.geometry.camera import intrinsics
 
@@ -30,20 +30,15 @@ _FEWEST_CORNERS = 6  # minimum number of inlier corners of a view; views with fe
 
 
 @dataclass(frozen=True, eq=False)
-class Bundle:
-    """Result of the bundle adjustment of C cameras over V views of a board with N corners."""
+class Bundle(BoardCameras):
+    """Result of the bundle adjustment; outlier corners are NaN, and views without corners are left out."""
 
-    K: Array  # intrinsic matrices [px], shape (C, 3, 3)
-    distortion: Array  # k1 and k2, shape (C, 2)
-    T_cam_world: Array  # transforms from world (the first camera) to camera [mm], shape (C, 4, 4)
-    T_world_board: Array  # transforms from board to world [mm], shape (V, 4, 4)
-    corners_px: Array  # pixels of the corners that were used, otherwise NaN, shape (C, V, N, 2)
     residuals_px: Array  # projected minus observed pixels, NaN for corners not used, shape (C, V, N, 2)
     parameters: Array  # Camera parameters (see `camera_from`), shape (12 C - 6,).
     covariance: Array  # Covariance of the camera parameters, shape (12 C - 6, 12 C - 6).
 
 
-def adjust(start: InitialGuess, points_mm: Array) -> Bundle:
+def adjust(start: BoardCameras, points_mm: Array) -> Bundle:
     """Adjust the bundle, discard outlier corners and adjust again; `points_mm` (N, 3) are the corners on the board.
 
     Raises:
@@ -97,7 +92,7 @@ class _Problem:
         # For each camera: the view index and corner index of every observed point.
         self.points = [np.nonzero(seen) for seen in self.seen]
 
-    def pack(self, start: InitialGuess) -> Array:
+    def pack(self, start: BoardCameras) -> Array:
         """Return the unknowns of an initial guess: lenses, poses of all cameras but the first, and board poses."""
         lens = np.stack([start.K[:, 0, 0], start.K[:, 1, 1], start.K[:, 0, 2], start.K[:, 1, 2]], axis=1)
         T = np.concatenate([start.T_cam_world[1:], start.T_world_board[self.views]])

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
-from typing import TypedDict
+from dataclasses import asdict
 
 import numpy as np
 
@@ -15,14 +14,14 @@ from jawusd.capture.bundle import Bundle, adjust
 from jawusd.capture.initial_guess import initial_cameras
 from jawusd.capture.scale import (
     ScaleCheck,
-    ShapeError,
     board_shape_error,
     check_scale,
     expected_shape_error,
     mouth_centre,
 )
 from jawusd.formats.capture import Capture
-from jawusd.geometry import Camera
+from jawusd.formats.notes import CalibrationNotes, CameraFigures
+from jawusd.geometry import Camera, transform_points
 
 #: Function that measures the scale of the calibration, given the cameras and the failed check of the picked points. The
 #: `reason` in that check explains why the picked points do not determine the scale.
@@ -37,41 +36,12 @@ _LITTLE_COVERAGE = 0.5
 _LARGE_EXPECTED_MM = 0.05  # expected error above which advice is given; half of the typical tracking error of 0.1 mm
 
 
-class CameraFigures(TypedDict):
-    """Statistics of one camera's calibration.
-
-    `coverage` is the fraction of image cells that contain corners. `blurred` and `missed` are image numbers.
-    """
-
-    views: int
-    rms_px: float
-    coverage: float
-    empty_corners: list[str]
-    blurred: list[int]
-    missed: list[int]
-
-
-@dataclass(frozen=True)
-class CalibrationReport:
-    """Accuracy of a calibration, with advice on how to improve it."""
-
-    cameras: dict[str, CameraFigures]
-    views: int  # number of board poses used
-    board_shape: ShapeError  # error of distances between triangulated corners near the mouth
-    expected_shape_mm: float  # mean error of distances in the mouth that the scatter of the corners implies
-    mouth_mm: tuple[float, float, float]  # centre of the mouth in world coordinates
-    mouth_from: str  # text that names the source of mouth_mm
-    scale: ScaleCheck  # check of the board's square size against the size of the teeth
-    advice: tuple[str, ...]  # possible improvements of the calibration, one sentence each
-    notes: tuple[str, ...]  # assumptions of the calibration, one sentence each
-
-
 def calibrate_capture(
     capture: Capture,
     scans: Mapping[str, Array],
     progress: Callable[[int, int], None],
     scale_without_picks: MeasureScale | None = None,
-) -> tuple[list[Camera], CalibrationReport]:
+) -> tuple[list[Camera], CalibrationNotes]:
     """Calibrate the cameras from the boards of a capture.
 
     Args:
@@ -98,7 +68,7 @@ def calibrate_detections(
     capture: Capture,
     scans: Mapping[str, Array],
     scale_without_picks: MeasureScale | None = None,
-) -> tuple[list[Camera], CalibrationReport]:
+) -> tuple[list[Camera], CalibrationNotes]:
     """Calibrate the cameras from detected corners; see `calibrate_capture`.
 
     Raises:
@@ -123,19 +93,17 @@ def calibrate_detections(
     centre, source = mouth_centre(cameras, capture.bootstrap, bundle.T_world_board)
     expected = expected_shape_error(cameras, bundle, centre) if len(cameras) > 1 else float("nan")
     figures = {camera.name: _camera_figures(c, camera, bundle, detections) for c, camera in enumerate(cameras)}
-    shape = board_shape_error(cameras, bundle, points, centre)
-    report = CalibrationReport(
-        figures,
-        len(bundle.T_world_board),
-        shape,
-        expected,
-        (float(centre[0]), float(centre[1]), float(centre[2])),
-        source,
-        scale,
-        tuple(_advice(figures, bundle, points, centre, expected)),
-        (*detections.notes, *_notes(detections, bundle, scale)),
+    return cameras, CalibrationNotes(
+        cameras=figures,
+        views=len(bundle.T_world_board),
+        board_shape=asdict(board_shape_error(cameras, bundle, points, centre)),
+        expected_shape_mm=expected,
+        mouth_mm=(float(centre[0]), float(centre[1]), float(centre[2])),
+        mouth_from=source,
+        scale=asdict(scale),
+        advice=list(_advice(figures, bundle, points, centre, expected)),
+        notes=[*detections.notes, *_notes(detections, bundle, scale)],
     )
-    return cameras, report
 
 
 def _camera_figures(c: int, camera: Camera, bundle: Bundle, detections: BoardDetections) -> CameraFigures:
@@ -166,8 +134,7 @@ def _advice(
             f"camera {fewest} uses {figures[fewest]['views']} views of the board; {_ENOUGH_VIEWS} or more give a more "
             "accurate result."
         )
-    corners = np.einsum("vij,nj->vni", bundle.T_world_board[:, :3, :3], points_mm)
-    corners += bundle.T_world_board[:, None, :3, 3]
+    corners = transform_points(bundle.T_world_board, points_mm)
     distance = float(np.median(np.linalg.norm(corners - centre_mm, axis=-1).min(1)))
     if distance > _FAR_MM:
         yield (

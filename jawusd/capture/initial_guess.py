@@ -26,8 +26,8 @@ _INTRINSIC_FLAGS = cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST
 
 
 @dataclass(frozen=True, eq=False)
-class InitialGuess:
-    """Initial values of the bundle adjustment of C cameras over V views of a board with N corners."""
+class BoardCameras:
+    """C cameras and V views of a board with N corners: initial values, or the result of the bundle adjustment."""
 
     K: Array  # intrinsic matrices [px], shape (C, 3, 3)
     distortion: Array  # k1 and k2 of each camera, shape (C, 2)
@@ -42,7 +42,7 @@ def initial_cameras(
     corners_px: Array,
     points_mm: Array,
     symmetries: list[NDArray[np.int64]],
-) -> InitialGuess:
+) -> BoardCameras:
     """Calibrate each camera separately, then estimate the camera poses from shared views.
 
     Args:
@@ -77,7 +77,7 @@ def initial_cameras(
         orders = dict(agreed)
         for c in seen:
             corners[c, v] = corners_px[c, v, symmetries[orders[c]]] if c in orders else np.nan
-    return InitialGuess(K, distortion, T_cam_world, T_world_board, corners)
+    return BoardCameras(K, distortion, T_cam_world, T_world_board, corners)
 
 
 def _single_camera(

@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -96,7 +95,6 @@ def align_videos(videos: Mapping[str, Path | ClipSource], reference: str, *, by_
         CaptureError: a video cannot be read.
     """
     opened = {name: open_clip(clip) for name, clip in videos.items()}
-    hint = _offsets_hint(videos)
     rate = opened[reference].timeline.rate
     _check_frame_rates(opened, reference)
     notes = _missing_pictures(opened)
@@ -107,10 +105,7 @@ def align_videos(videos: Mapping[str, Path | ClipSource], reference: str, *, by_
             dark = next((name for name in opened if found[name][1]), None)
         if by_light and dark is None:
             steps = {name: to_frames(found[name][0], video.timeline.numbers) for name, video in opened.items()}
-            offsets = {
-                name: _compared(name, reference, video, hint, partial(match_steps, steps[name], steps[reference], rate))
-                for name, video in opened.items()
-            }
+            offsets = _compared(opened, reference, lambda name: match_steps(steps[name], steps[reference], rate))
             return Alignment(reference, offsets, "light flash", (*notes, *_stopped_early(opened, offsets, rate)))
         found_sounds = pool.map(
             lambda video: read_sound(video.path, RATE_HZ) if isinstance(video, Video) else None, opened.values()
@@ -120,11 +115,10 @@ def align_videos(videos: Mapping[str, Path | ClipSource], reference: str, *, by_
     silent = [name for name in opened if name not in sounds]
     if silent:
         whose = "no clip has" if len(silent) == len(opened) else f"camera {silent[0]} has no"
-        raise SyncError(f"{why}{whose} sound to use instead.", path=opened[dark or silent[0]].path, hint=hint)
-    offsets = {
-        name: _compared(name, reference, video, hint, partial(_by_sound, name, reference, sounds, opened, rate), why)
-        for name, video in opened.items()
-    }
+        raise SyncError(
+            f"{why}{whose} sound to use instead.", path=opened[dark or silent[0]].path, hint=_offsets_hint(videos)
+        )
+    offsets = _compared(opened, reference, lambda name: _by_sound(name, reference, sounds, opened, rate), why)
     by_sound = (f"{why}the cameras are synchronised by sound",) if why else ()
     return Alignment(reference, offsets, "sound", (*by_sound, *notes, *_stopped_early(opened, offsets, rate)))
 
@@ -173,15 +167,17 @@ def _by_sound(name: str, reference: str, sounds: Mapping[str, Sound], videos: Ma
 
 
 def _compared(
-    name: str, reference: str, video: Clip, hint: str, work: Callable[[], Offset], before: str = ""
-) -> Offset:
-    """Return the offset between two cameras; errors name both cameras."""
-    try:
-        return work()
-    except SyncError as error:
-        raise SyncError(
-            f"{before}camera {name}, compared with {reference}: {error.statement()}", path=video.path, hint=hint
-        ) from error
+    videos: Mapping[str, Clip], reference: str, offset_of: Callable[[str], Offset], before: str = ""
+) -> dict[str, Offset]:
+    """Return the offset of each camera from the reference camera; errors name both cameras."""
+    out = {}
+    for name, video in videos.items():
+        try:
+            out[name] = offset_of(name)
+        except SyncError as error:
+            message = f"{before}camera {name}, compared with {reference}: {error.statement()}"
+            raise SyncError(message, path=video.path, hint=_offsets_hint(videos)) from error
+    return out
 
 
 def _offsets_hint(names: Iterable[str]) -> str:

@@ -13,9 +13,9 @@ from jawusd.cli.output import shortened
 from jawusd.formats.finding import Finding
 
 if TYPE_CHECKING:
+    from jawusd.formats.notes import CalibrationNotes, SyncNotes
     from jawusd.geometry import Camera
     from jawusd.photographs.align import PhotographFiles
-    from jawusd.pipeline.calibrate import CalibrationSummary, SyncResult
     from jawusd.pipeline.check import Examined
     from jawusd.pipeline.scans import ScansSummary
     from jawusd.pipeline.segment_record import SegmentSummary
@@ -33,7 +33,7 @@ _LISTED = 10  # maximum number of images listed per camera
 _LISTED_MASKS = 12
 
 
-def calibration_lines(report: CalibrationSummary) -> list[str]:
+def calibration_lines(report: CalibrationNotes) -> list[str]:
     """Return a calibration report as text."""
     lines = [f"calibrated from {report['views']} views of the board"]
     for name, camera in report["cameras"].items():
@@ -58,7 +58,7 @@ def calibration_lines(report: CalibrationSummary) -> list[str]:
     return lines + [f"  note: {note}" for note in report["notes"]] + [f"  advice: {text}" for text in report["advice"]]
 
 
-def sync_lines(result: SyncResult) -> list[str]:
+def sync_lines(result: SyncNotes) -> list[str]:
     """Return frame offsets as text."""
     exact, sure = result.get("exact_frames", {}), result.get("confidence", {})
     lines = [f"by {result['method']}:"]

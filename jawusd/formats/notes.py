@@ -114,11 +114,40 @@ class ModelMeta(TypedDict, total=False):
 
 
 class SyncNotes(TypedDict, total=False):
-    """Result of the synchronisation, by camera."""
+    """Offset of every camera from the reference camera [frames], with quality figures of the method that found it."""
 
-    method: str
-    offsets: dict[str, Frames]
+    method: Required[str]
+    offsets: Required[dict[str, Frames]]
+    reference: str
+    exact_frames: dict[str, float]
     confidence: dict[str, float]
+    notes: list[str]
+
+
+class CameraFigures(TypedDict):
+    """Statistics of one camera's calibration."""
+
+    views: int
+    rms_px: float
+    coverage: float  # fraction of image cells that contain corners
+    empty_corners: list[str]
+    blurred: list[int]  # image numbers
+    missed: list[int]  # image numbers
+
+
+class CalibrationNotes(TypedDict):
+    """Accuracy of a calibration, with advice on how to improve it."""
+
+    cameras: dict[str, CameraFigures]
+    views: int  # number of board poses used
+    board_shape: dict[str, float]  # `capture.scale.ShapeError` of corners near the mouth
+    expected_shape_mm: float  # mean error of distances in the mouth that the scatter of the corners implies
+    mouth_mm: tuple[float, float, float]  # centre of the mouth in world coordinates
+    mouth_from: str  # text that names the source of mouth_mm
+    #: `capture.scale.ScaleCheck` of the board's square size against the size of the teeth
+    scale: dict[str, float | str | None]
+    advice: list[str]  # possible improvements of the calibration, one sentence each
+    notes: list[str]  # assumptions of the calibration, one sentence each
 
 
 def check_notes(meta: Mapping[str, object], kind: type[TracksMeta] | type[ModelMeta], path: AnyPath) -> None:

@@ -14,9 +14,10 @@ from jawusd.base.errors import explain_missing_packages, naming_file
 from jawusd.formats.capture import Capture
 from jawusd.formats.finding import Finding, FoundJson
 from jawusd.formats.model import load_model, save_model
+from jawusd.formats.notes import CalibrationNotes, SyncNotes
 from jawusd.formats.tracks import load_tracks, save_tracks
 from jawusd.pipeline.bake import bake_subject, write_take
-from jawusd.pipeline.calibrate import CalibrationSummary, SyncResult, calibrate_boards, sync_cameras
+from jawusd.pipeline.calibrate import calibrate_boards, sync_cameras
 from jawusd.pipeline.cameras import rescaled_cameras
 from jawusd.pipeline.check import check_capture, refuse_errors
 from jawusd.pipeline.fit import FitSummary, fit_subject, fit_summary
@@ -70,8 +71,8 @@ class BuildSummary(TypedDict):
     seconds: dict[str, float]  # duration of each stage [s]; for a reused stage, the duration of its last run
     reused: list[str]  # stages reused from an earlier build
     findings: list[FoundJson]  # the findings of the check before the first stage, as `Finding.as_json`
-    calibrate: CalibrationSummary | None  # summary of the calibration; None if the capture names a calibration file
-    sync: SyncResult
+    calibrate: CalibrationNotes | None  # summary of the calibration; None if the capture names a calibration file
+    sync: SyncNotes
     track: TrackSummary  # summary of the final tracks
     fit: FitSummary
     report: ReportSummary
@@ -79,8 +80,8 @@ class BuildSummary(TypedDict):
 
 CHECK = Stage("check", CheckResult, 8.0)
 SCANS = Stage("scans", dict[str, str], 5.0)
-CALIBRATE = Stage("calibrate", CalibrationSummary, 60.0)
-SYNC = Stage("sync", SyncResult, 3.0)
+CALIBRATE = Stage("calibrate", CalibrationNotes, 60.0)
+SYNC = Stage("sync", SyncNotes, 3.0)
 TRACK = Stage("track", TrackSummary, 10.0, 0.15)
 FIT = Stage("fit", FitSummary, 15.0)
 REFINE = Stage("refine", TrackSummary, 5.0, 0.03)
@@ -185,7 +186,7 @@ def _labelled(run: Workspace) -> StageRecord[dict[str, str]]:
     return record
 
 
-def _calibrated(run: Workspace) -> StageRecord[CalibrationSummary]:
+def _calibrated(run: Workspace) -> StageRecord[CalibrationNotes]:
     """Calibrate the cameras from the boards."""
     capture, path = run.capture, run.folder / CALIBRATION
     boards = capture.boards.model_dump(mode="json", exclude={"videos"}) if capture.boards else None
@@ -205,7 +206,7 @@ def _check(run: Workspace) -> tuple[list[Path], CheckResult]:
     return [], {"findings": [finding.as_json() for finding in findings]}
 
 
-def _sync(run: Workspace) -> tuple[list[Path], SyncResult]:
+def _sync(run: Workspace) -> tuple[list[Path], SyncNotes]:
     return [], sync_cameras(run.capture, run.progress)
 
 

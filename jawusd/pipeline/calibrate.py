@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, NotRequired, cast
-
-from typing_extensions import TypedDict
+from typing import TYPE_CHECKING
 
 from jawusd.base.errors import SyncError, TrackingError, explain_missing_packages, naming_file
 from jawusd.cameras.calibration import save_calibration
@@ -16,7 +13,7 @@ from jawusd.formats.atomic import write_text_atomic
 from jawusd.formats.capture import Capture
 from jawusd.formats.clips import ClipSource, LightCurve
 from jawusd.formats.mesh import Mesh
-from jawusd.formats.text import Frames
+from jawusd.formats.notes import CalibrationNotes, SyncNotes
 from jawusd.geometry import Camera
 from jawusd.pipeline.state import Progress
 from jawusd.pipeline.subject import load_meshes
@@ -30,43 +27,8 @@ PLOT_SUFFIXES = (".png", ".svg")
 _SIZE_SIGMA = 0.005  # standard deviation of the scale factor estimated from masks
 
 
-class CameraReport(TypedDict):
-    """Quality of the calibration of one camera."""
-
-    views: int
-    rms_px: float
-    coverage: float
-    blurred: list[int]  # image numbers
-    missed: list[int]  # image numbers
-
-
-class CalibrationSummary(TypedDict):
-    """`capture.calibrate.CalibrationReport` as plain data."""
-
-    cameras: dict[str, CameraReport]
-    views: int
-    board_shape: dict[str, float]
-    expected_shape_mm: float
-    mouth_mm: tuple[float, float, float]
-    mouth_from: str
-    scale: dict[str, float | str | None]
-    advice: list[str]
-    notes: list[str]
-
-
-class SyncResult(TypedDict):
-    """Offset of every camera from the reference camera [frames], with quality figures of the method that found it."""
-
-    offsets: dict[str, Frames]
-    method: str
-    reference: NotRequired[str]
-    exact_frames: NotRequired[dict[str, float]]
-    confidence: NotRequired[dict[str, float]]
-    notes: NotRequired[list[str]]
-
-
 @explain_missing_packages()
-def calibrate_boards(capture: Capture, out: Path, progress: Progress) -> CalibrationSummary:
+def calibrate_boards(capture: Capture, out: Path, progress: Progress) -> CalibrationNotes:
     """Calibrate the cameras from the boards of a capture and write the calibration as aniposelib TOML.
 
     Raises:
@@ -86,7 +48,7 @@ def calibrate_boards(capture: Capture, out: Path, progress: Progress) -> Calibra
             lambda cameras, by_picks: _scale_by_masks(capture, meshes, cameras, by_picks, progress),
         )
     save_calibration(out, cameras)
-    return cast(CalibrationSummary, asdict(report))  # asdict returns an untyped dict
+    return report
 
 
 def _scale_by_masks(
@@ -110,19 +72,24 @@ def _scale_by_masks(
     return checked_scale(ratio, _SIZE_SIGMA, capture.boards.square_mm)
 
 
+def known_sync(capture: Capture) -> SyncNotes | None:
+    """Return the frame offsets of the cameras if they are known without decoding clips, otherwise None."""
+    if capture.sync.offsets is not None:
+        return SyncNotes(offsets=dict(capture.sync.offsets), method="given in the capture")
+    if len(capture.cameras) == 1 or any(camera.video is None for camera in capture.cameras):
+        return SyncNotes(offsets={camera.name: 0 for camera in capture.cameras}, method="taken as simultaneous")
+    return None
+
+
 @explain_missing_packages()
-def sync_cameras(capture: Capture, progress: Progress) -> SyncResult:
+def sync_cameras(capture: Capture, progress: Progress) -> SyncNotes:
     """Return the frame offset of every camera relative to the reference camera.
 
     Raises:
         SyncError: no flash was found, or the flashes of two cameras do not match.
     """
     progress("sync", 0, 1)
-    if capture.sync.offsets is not None:
-        result = SyncResult(offsets=dict(capture.sync.offsets), method="given in the capture")
-    elif len(capture.cameras) == 1 or any(camera.video is None for camera in capture.cameras):
-        result = SyncResult(offsets={camera.name: 0 for camera in capture.cameras}, method="taken as simultaneous")
-    else:
+    if (result := known_sync(capture)) is None:
         from jawusd.capture.sync import estimate_offsets
 
         with naming_file(capture.folder / "capture.toml"):
@@ -132,7 +99,7 @@ def sync_cameras(capture: Capture, progress: Progress) -> SyncResult:
 
 
 @explain_missing_packages()
-def sync_videos(videos: Mapping[str, Path | ClipSource], reference: str, progress: Progress) -> SyncResult:
+def sync_videos(videos: Mapping[str, Path | ClipSource], reference: str, progress: Progress) -> SyncNotes:
     """Return the frame offset of every camera's clip relative to the reference; see `capture.sync.align_videos`.
 
     Raises:
@@ -146,9 +113,9 @@ def sync_videos(videos: Mapping[str, Path | ClipSource], reference: str, progres
     return result
 
 
-def _sync_result(alignment: Alignment) -> SyncResult:
+def _sync_result(alignment: Alignment) -> SyncNotes:
     """Return an alignment as plain data."""
-    return SyncResult(
+    return SyncNotes(
         offsets=alignment.offsets,
         reference=alignment.reference,
         method=alignment.method,
@@ -185,7 +152,7 @@ def write_light_curves(path: Path, curves: Mapping[str, LightCurve]) -> None:
 
 
 @explain_missing_packages()
-def write_sync_plot(path: Path, curves: Mapping[str, LightCurve], result: SyncResult | None) -> None:
+def write_sync_plot(path: Path, curves: Mapping[str, LightCurve], result: SyncNotes | None) -> None:
     """Draw the brightness of all clips before and, if they could be aligned, after alignment, as .png or .svg.
 
     Raises:

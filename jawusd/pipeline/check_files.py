@@ -19,6 +19,7 @@ from jawusd.formats.file_names import is_pattern
 from jawusd.formats.finding import Finding, Severity
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry import LANDMARKS, Camera
+from jawusd.pipeline.calibrate import known_sync
 from jawusd.pipeline.cameras import load_cameras, rescaled_cameras
 from jawusd.pipeline.subject import BONES, MESHES, TEETH, label_teeth, subject_of_capture
 
@@ -69,12 +70,8 @@ class Parts:
 
     def offsets(self) -> Mapping[str, int] | None:
         """Return the frame offsets of the cameras if they are known without decoding clips, otherwise None."""
-        capture = self.given
-        if capture.sync.offsets is not None:
-            return capture.sync.offsets
-        if len(capture.cameras) == 1 or any(camera.video is None for camera in capture.cameras):
-            return {camera.name: 0 for camera in capture.cameras}
-        return None
+        found = known_sync(self.given)
+        return None if found is None else found["offsets"]
 
     def offset_guesses(self) -> list[Mapping[str, int]]:
         """Return the frame offsets or, if unknown, two guesses: zero, and offsets that align the first masks."""

@@ -138,7 +138,7 @@ def _without_pictures(
         actor=subject.name,
         tracks=tracks,
         model=model,
-        sync=facts.state.result("sync", SyncNotes) or {},
+        sync=facts.state.result("sync", SyncNotes) or SyncNotes(method="not recorded", offsets={}),
         cameras=attempt("cameras", left_out, lambda: camera_facts(facts.given())) or (),
         inferred=tuple(fit_summary(model).get("inferred", ())),
         seconds={name: record.seconds for name, record in stages.items()},
@@ -262,7 +262,8 @@ def recorded_offsets(state: BuildState) -> dict[str, int]:
     Raises:
         FormatError: build.json is corrupt.
     """
-    return (state.result("sync", SyncNotes) or {}).get("offsets", {})
+    found = state.result("sync", SyncNotes)
+    return found["offsets"] if found else {}
 
 
 def camera_facts(capture: Capture) -> tuple[CameraFacts, ...]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePath
 from typing import TYPE_CHECKING
 
@@ -190,18 +190,18 @@ def _named_as_calibrated(
 def _board(
     folder: Path, cameras: Sequence[CameraSketch], square_mm: float | None, calibrated: bool, out: CaptureStart
 ) -> BoardSketch | None:
-    from jawusd.capture.board_detection import DetectedBoard, detect_board
+    from jawusd.capture.board_detection import detect_board
 
     clips = [camera.board for camera in cameras if camera.board is not None]
     if not clips:
         return None
-    seen: list[DetectedBoard] = []
+    seen: list[BoardSketch] = []
     for clip in clips:
         video = next(iter(_opened(folder, [clip], out).values()), None)
         if video is not None and (found := detect_board(_some_pictures(video))) is not None:
             seen.append(found)
-    board = max(seen, key=seen.count, default=DetectedBoard("chessboard"))
-    sketch = BoardSketch(board.pattern, board.cols, board.rows, square_mm, board.dictionary)
+    board = max(seen, key=seen.count, default=BoardSketch())
+    sketch = replace(board, square_mm=square_mm)
     if calibrated:
         return sketch
     if not seen:

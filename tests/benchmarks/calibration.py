@@ -34,11 +34,12 @@ def main() -> None:
     if options.file is None:
         blind = capture.model_copy(update={"calibration": None})
         cameras, report = calibrate_capture(blind, scans, lambda done, total: None)
-        for name, figures in report.cameras.items():
+        for name, figures in report["cameras"].items():
             print(f"{name}: rms {figures['rms_px']:.3f} px in {figures['views']} views")
-        shape = report.board_shape
-        print(f"on the boards near the mouth: mean {shape.mean:.4f}, p95 {shape.p95:.4f}, max {shape.max:.4f} mm")
-        print(f"expected from the corners' scatter: mean {report.expected_shape_mm:.4f} mm")
+        shape = report["board_shape"]
+        listed = ", ".join(f"{name} {shape[name]:.4f}" for name in ("mean", "p95", "max"))
+        print(f"on the boards near the mouth: {listed} mm")
+        print(f"expected from the corners' scatter: mean {report['expected_shape_mm']:.4f} mm")
         with tempfile.TemporaryDirectory() as folder:
             path = options.keep or Path(folder) / "calibration.toml"
             save_calibration(path, cameras)

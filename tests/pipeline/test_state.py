@@ -11,7 +11,7 @@ import sys
 import pytest
 
 from jawusd.base.errors import FormatError, OutputError
-from jawusd.pipeline.calibrate import SyncResult
+from jawusd.formats.notes import SyncNotes
 from jawusd.pipeline.report import CheckResult
 from jawusd.pipeline.state import BUILD_FILE, LABELS, BuildState, changed_files, hash_files, hash_value, locked
 
@@ -169,7 +169,7 @@ def test_forged_results_are_one_clear_error(tmp_path, offsets):
     state = BuildState(tmp_path)
     state.finish("sync", "", [], 1.0, {"offsets": offsets, "method": "given"})
     with pytest.raises(FormatError, match=r"is damaged \(sync\.offsets"):
-        BuildState(tmp_path).result("sync", SyncResult)
+        BuildState(tmp_path).result("sync", SyncNotes)
 
 
 @pytest.mark.parametrize("found", [{"frame": float("inf")}, {"frame": "x"}, {"value": "x"}, "text", {"kind": []}])
