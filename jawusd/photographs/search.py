@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from itertools import product
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -104,15 +105,12 @@ def _row_frame(scan: Scan, arch: int, side: float) -> Array:
     return make_transform(T[:3, :3], np.array([T[0, 3], -edge, -np.percentile(z, 99.5)]))
 
 
-def searched(
-    drawing: Drawing, crowns: Sequence[Crowns], usual: TypicalBite, T_upper_lower: Array, count: int
-) -> list[Candidate]:
-    """Return the most promising views of both arches, at most one per viewing direction, best first.
+def searched(drawing: Drawing, crowns: Sequence[Crowns], usual: TypicalBite, T_upper_lower: Array) -> list[Candidate]:
+    """Return the most promising views of both arches, at most one per viewing direction.
 
     Args:
         crowns: upper and lower, decimated for fast rendering.
         T_upper_lower: the assumed bite, shape (4, 4).
-        count: number of mirrored candidates to return, and number of unmirrored candidates.
     """
     size = next_fast_len(int(1.3 * _PX_PER_MM * _WIDTHS_MM.max()), real=True)
     drawn = list(_drawn_spectra(drawing, size))
@@ -136,8 +134,7 @@ def searched(
             pose[:2, 3] += np.array(shift) / _PX_PER_MM
             best[mirrored] = Candidate(share, pose, drawing.size_px[0] / width_mm * _DISTANCE_MM, mirrored)
         found += best.values()
-    found.sort(key=lambda one: -one.share)
-    return [one for way in (False, True) for one in [k for k in found if k.mirrored is way][:count]]
+    return _of_each_hand(found, lambda one: -one.share, _CANDIDATES)
 
 
 def _facing(turn: tuple[float, float, float]) -> Array:
@@ -210,37 +207,37 @@ class PhotoStart:
     """Initial pose of one photograph."""
 
     misfit: float  # misfit of its lines (see `Aligner.misfit`) [-]
-    other_misfit: float  # smallest misfit of a start with the opposite mirroring
     mirrored: bool
     bite: Bite  # pose and bite from this photograph alone, at reduced size
     rows: ArchPair
+    other_misfit: float = 1.0  # smallest misfit of a start with the opposite mirroring
 
 
 def find_first(drawing: Drawing, scans: Sequence[Scan], usual: Sequence[TypicalBite], contact: Contact) -> PhotoStart:
     """Return the best start of a photograph with an unknown bite, searching around typical bites."""
-    tried = []
-    for bite in usual:
-        rows = ArchPair.of(scans, bite)
-        found = _aligned_candidates(drawing, rows, rows.usual.T_upper_lower)
-        tried += [(misfit, mirrored, one, rows) for misfit, mirrored, one in found]
-    tried.sort(key=lambda one: one[0])
-    ends = []
-    for _, mirrored, one, rows in _finalists(tried):
-        aligner = Aligner(rows.thin, rows.usual.T_upper_lower, contact)
-        for begin in _slid(one, rows, aligner):
-            end = aligner.aligned(begin, _SLID_GATES)
-            ends.append((_misfit(aligner, end), mirrored, end, rows))
-    return _best(ends)
+    pairs = [ArchPair.of(scans, bite) for bite in usual]
+    tried = [start for rows in pairs for start in _aligned_candidates(drawing, rows, rows.usual.T_upper_lower)]
+    return _best(tried, contact, _slid)
 
 
-def _slid(bite: Bite, rows: ArchPair, aligner: Aligner) -> list[Bite]:
-    """Return the given bite and the best of the shifted ones."""
-    axes = rows.usual.T_anatomical_upper[:3, :3]
-    out = []
-    for slide in product(_ASIDE_MM, _UP_MM, _AHEAD_MM):
-        T_upper_lower = make_transform(np.eye(3), axes.T @ slide) @ rows.usual.T_upper_lower
-        out.append(Bite(bite.photos, T_upper_lower, bite.gum_mm))
-    return [bite, *sorted(out, key=lambda one: _misfit(aligner, one))[:_SLIDES]]
+def find_next(drawing: Drawing, rows: ArchPair, T_upper_lower: Array, contact: Contact) -> PhotoStart:
+    """Return the best start of a photograph, given an approximate bite from another photograph."""
+
+    def with_bite(start: PhotoStart, aligner: Aligner) -> list[Bite]:
+        return [replace(start.bite, T_upper_lower=T_upper_lower)]
+
+    return _best(_aligned_candidates(drawing, rows, T_upper_lower), contact, with_bite)
+
+
+def _aligned_candidates(drawing: Drawing, rows: ArchPair, T_upper_lower: Array) -> Iterator[PhotoStart]:
+    """Yield the most promising views after some alignment steps."""
+    aligner = Aligner(rows.thin, rows.usual.T_upper_lower, None)
+    factor = _WIDTH_PX / drawing.size_px[0]
+    for one in searched(drawing, rows.thin, rows.usual, T_upper_lower):
+        lines = drawing.mirrored() if one.mirrored else drawing
+        photo = Photo(lines, PhotoPose(one.T_cam_upper, one.focal_px, 0.0)).shrunk(factor)
+        bite = aligner.aligned(Bite((photo,), T_upper_lower, np.zeros(2)), _WIDE_GATES)
+        yield PhotoStart(_misfit(aligner, bite), one.mirrored, bite, rows)
 
 
 def _misfit(aligner: Aligner, bite: Bite) -> float:
@@ -248,37 +245,36 @@ def _misfit(aligner: Aligner, bite: Bite) -> float:
     return float(aligner.misfit(bite, _MISFIT_GATE_MM).mean())
 
 
-def find_next(drawing: Drawing, rows: ArchPair, T_upper_lower: Array, contact: Contact) -> PhotoStart:
-    """Return the best start of a photograph, given an approximate bite from another photograph."""
-    found = _aligned_candidates(drawing, rows, T_upper_lower)
-    aligner = Aligner(rows.thin, rows.usual.T_upper_lower, contact)
-    ends = []
-    for _, mirrored, one, _ in _finalists([(*entry, rows) for entry in found]):
-        again = aligner.aligned(Bite(one.photos, T_upper_lower, one.gum_mm), _SLID_GATES)
-        ends.append((_misfit(aligner, again), mirrored, again, rows))
-    return _best(ends)
-
-
-def _aligned_candidates(drawing: Drawing, rows: ArchPair, T_upper_lower: Array) -> list[tuple[float, bool, Bite]]:
-    """Return the misfits, mirrorings and poses of the most promising views after some alignment steps, best first."""
-    aligner = Aligner(rows.thin, rows.usual.T_upper_lower, None)
-    factor = _WIDTH_PX / drawing.size_px[0]
+def _slid(start: PhotoStart, aligner: Aligner) -> list[Bite]:
+    """Return the bite of a start, and the best of the shifted ones."""
+    usual = start.rows.usual
+    axes = usual.T_anatomical_upper[:3, :3]
     out = []
-    for one in searched(drawing, rows.thin, rows.usual, T_upper_lower, _CANDIDATES):
-        lines = drawing.mirrored() if one.mirrored else drawing
-        photo = Photo(lines, PhotoPose(one.T_cam_upper, one.focal_px, 0.0)).shrunk(factor)
-        bite = aligner.aligned(Bite((photo,), T_upper_lower, np.zeros(2)), _WIDE_GATES)
-        out.append((_misfit(aligner, bite), one.mirrored, bite))
-    return sorted(out, key=lambda entry: entry[0])
+    for slide in product(_ASIDE_MM, _UP_MM, _AHEAD_MM):
+        T_upper_lower = make_transform(np.eye(3), axes.T @ slide) @ usual.T_upper_lower
+        out.append(replace(start.bite, T_upper_lower=T_upper_lower))
+    return [start.bite, *sorted(out, key=lambda one: _misfit(aligner, one))[:_SLIDES]]
 
 
-def _finalists(tried: Sequence[tuple[float, bool, Bite, ArchPair]]) -> list[tuple[float, bool, Bite, ArchPair]]:
-    """Return the best starts, with equal numbers of mirrored and unmirrored starts for a fair comparison."""
-    ordered = sorted(tried, key=lambda one: one[0])
-    return [one for way in (False, True) for one in [o for o in ordered if o[1] is way][:_FINALISTS]]
+def _best(
+    tried: Iterable[PhotoStart], contact: Contact, bites: Callable[[PhotoStart, Aligner], list[Bite]]
+) -> PhotoStart:
+    """Return the best start after alignment of the finalists from each of the given bites."""
+    ends = []
+    for start in _of_each_hand(tried, lambda one: one.misfit, _FINALISTS):
+        aligner = Aligner(start.rows.thin, start.rows.usual.T_upper_lower, contact)
+        for begin in bites(start, aligner):
+            bite = aligner.aligned(begin, _SLID_GATES)
+            ends.append(replace(start, misfit=_misfit(aligner, bite), bite=bite))
+    best = min(ends, key=lambda one: one.misfit)
+    other = min((one.misfit for one in ends if one.mirrored is not best.mirrored), default=1.0)
+    return replace(best, other_misfit=other)
 
 
-def _best(ends: Sequence[tuple[float, bool, Bite, ArchPair]]) -> PhotoStart:
-    misfit, mirrored, bite, rows = min(ends, key=lambda one: one[0])
-    other = min((one[0] for one in ends if one[1] is not mirrored), default=1.0)
-    return PhotoStart(misfit, other, mirrored, bite, rows)
+S = TypeVar("S", Candidate, PhotoStart)
+
+
+def _of_each_hand(found: Iterable[S], badness: Callable[[S], float], count: int) -> list[S]:
+    """Return the best unmirrored and the best mirrored views, `count` of each for a fair comparison."""
+    ordered = sorted(found, key=badness)
+    return [one for way in (False, True) for one in [each for each in ordered if each.mirrored is way][:count]]

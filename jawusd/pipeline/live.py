@@ -22,10 +22,9 @@ from jawusd.pipeline.cameras import load_cameras
 from jawusd.pipeline.live_jaw import LiveFrame, LiveJaw, LiveSkin
 from jawusd.pipeline.picture_search import arches_apart, least_fit, orientations, rough_masks
 from jawusd.pipeline.skin import SkinOptions
-from jawusd.pipeline.solve_videos import PreparedTeeth, VideoOptions, VideoShot
 from jawusd.pipeline.state import no_progress
 from jawusd.pipeline.subject import load_labelled, registered_meshes
-from jawusd.pipeline.track_videos import Cutter
+from jawusd.pipeline.videos import Cutter, PreparedTeeth, VideoOptions, VideoShot
 from jawusd.pipeline.workspace import open_capture
 from jawusd.segmentation.picture import Pictures
 from jawusd.tracking.contour.scan import teeth_centre

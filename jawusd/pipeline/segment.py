@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import cast
 
@@ -23,7 +22,7 @@ from jawusd.pipeline.segment_guide import known_guide, save_guide
 from jawusd.pipeline.segment_record import LEARNED, CameraEntry, FrameEntry, Journal, TrackEntry
 from jawusd.pipeline.state import Progress, hash_files, hash_value
 from jawusd.pipeline.subject import load_meshes, subject_of_capture
-from jawusd.pipeline.track_videos import Follower
+from jawusd.pipeline.videos import Follower
 from jawusd.pipeline.workspace import input_hashes
 from jawusd.segmentation.camera import CameraSegmenter, Segment
 from jawusd.segmentation.colours import ColourStates, SegmentationConfig, state_files
@@ -63,14 +62,6 @@ def segment_teeth(
         return _Segmentation(capture, offsets, folder, options, progress, pool).run()
 
 
-@dataclass(eq=False)
-class _OpenFrame:
-    """A frame that is being tracked: its images, and the latest masks by camera, None if there is no image."""
-
-    pictures: Pictures
-    segments: dict[str, Segment | None] = field(default_factory=dict)
-
-
 class _Segmentation:
     """One run of the segmentation over the frames of a capture."""
 
@@ -96,7 +87,8 @@ class _Segmentation:
         self._inputs = self._hashed_inputs(options.keys)
         self._journal = Journal(folder, self._inputs, options.resume)
         self._guide = known_guide(folder, self._inputs) if options.resume else {}
-        self._open: dict[int, _OpenFrame] = {}
+        self._pictures: Pictures = {}  # images of the frame that is being tracked
+        self._segments: dict[str, Segment | None] = {}  # its latest masks by camera, None if there is no image
         self._segmenters: dict[str, CameraSegmenter] = {}
 
     def _hashed_inputs(self, keys: Path | None) -> str:
@@ -120,9 +112,8 @@ class _Segmentation:
             for path in (*state_files(self._folder), self._folder / LEARNED):
                 path.unlink(missing_ok=True)
             self._new_segmenters(poses)
-            with self._opened(start, self._footage.at(start)) as shown:
-                record = self._tracker.begin(start, self._guide[start].poses)
-                self._write(start, record, shown.segments)
+            self._pictures = self._footage.at(start)
+            self._write(start, self._tracker.begin(start, self._guide[start].poses))
         self._progress("segment", len(self._journal.entries), self._stop - self._first)
         for step, end in ((1, self._stop), (-1, self._first - 1)):
             self._track_to(start, end, step)
@@ -151,15 +142,6 @@ class _Segmentation:
         rows = ArchStart(self._meshes, (upper, lower), self._capture.anatomy.T_anatomical_skull, self._pool.map)
         return follower, PictureSearch(self._footage, self._cameras, self._offsets, rows, follower.start_at)
 
-    @contextlib.contextmanager
-    def _opened(self, frame: int, pictures: Pictures) -> Iterator[_OpenFrame]:
-        """Make the images of a frame available to the tracker, and collect the masks segmented from them."""
-        self._open[frame] = _OpenFrame(pictures)
-        try:
-            yield self._open[frame]
-        finally:
-            del self._open[frame]
-
     def _new_segmenters(self, poses: Array) -> None:
         self._segmenters = {
             name: CameraSegmenter(camera, self._meshes, poses, self._config) for name, camera in self._cameras.items()
@@ -180,21 +162,21 @@ class _Segmentation:
         self._journal.drop(range(before + step if before is not None else start + step, done + step, step))
         if before is None:  # learn colours from the poses of the start frame
             before = start
-            with self._opened(start, self._footage.at(start)):
-                self._see(start, poses, 0)
+            self._pictures = self._footage.at(start)
+            self._see(start, poses, 0)
         frames = range(before + step, end, step)
         past = [self._past(frame) for frame in range(start, before + step, step)]
         guide = {frame: found.poses for frame, found in self._guide.items()}
         follow = self._tracker.follow(frames, guide, past)
         for frame, pictures in self._footage.walk(frames):
             known = {name: model.counts() for name, model in colours.items()}
-            with self._opened(frame, pictures) as shown:
-                _, record = next(follow)
+            self._pictures = pictures
+            _, record = next(follow)
             if (record.status == LOST).any():  # discard colours learned from a wrong image region
                 for name, model in colours.items():
                     model.restore(*known[name])
             state.save(frame, step)
-            self._write(frame, record, shown.segments)
+            self._write(frame, record)
             self._progress("segment", len(self._journal.entries), self._stop - self._first)
 
     def _past(self, frame: int) -> FrameSummary:
@@ -233,37 +215,35 @@ class _Segmentation:
             segmenter.configure(config)
         again = [frame for frame in range(self._first, self._stop) if "again" not in self._journal.entries[frame]]
         for frame, pictures in self._footage.walk(range(again[0], self._stop)) if again else ():
-            with self._opened(frame, pictures) as shown:
-                record = self._tracker.judge(frame, *self._journal.known(frame))
-            self._write(frame, record, shown.segments, again=True)
+            self._pictures = pictures
+            self._write(frame, self._tracker.judge(frame, *self._journal.known(frame)), again=True)
             self._progress("segment again", frame + 1 - self._first, self._stop - self._first)
 
     def _see(self, frame: int, poses: Array, turn: int) -> list[View]:
         """Segment the images of a frame, and return the masks as views for the tracker."""
-        shown = self._open[frame]
 
         def one(name: str) -> Segment | None:
-            image, own = shown.pictures[name], self._footage.number(name, frame)
+            image, own = self._pictures[name], self._footage.number(name, frame)
             if image is None or own is None:
                 return None
             found = self._segmenters[name].segment(image, poses, turn, self._keys.of(name, own))
             # Skip arches that were not found by colour: a mask segmented around a wrong pose would confirm it.
             return None if found is None else found.only(self._guide[frame].found)
 
-        shown.segments = dict(zip(self._cameras, self._pool.map(one, self._cameras), strict=True))
+        self._segments = dict(zip(self._cameras, self._pool.map(one, self._cameras), strict=True))
         views = []
-        for name, found in shown.segments.items():
+        for name, found in self._segments.items():
             camera = self._cameras[name] if found is None else found.camera
             masks = np.zeros((2, 1, 1), np.uint8) if found is None else found.masks
             present = np.zeros(2, bool) if found is None else found.present
             views.append(View(camera.projection_matrix(), camera.centre_world(), masks, present))
         return views
 
-    def _write(self, frame: int, record: FrameRecord, segments: dict[str, Segment | None], again: bool = False) -> None:
+    def _write(self, frame: int, record: FrameRecord, again: bool = False) -> None:
         """Write the masks and the record of a frame."""
         residual = view_residual_px(record.solution)
         cameras: dict[str, CameraEntry] = {}
-        for k, (name, found) in enumerate(segments.items()):
+        for k, (name, found) in enumerate(self._segments.items()):
             own = self._footage.number(name, frame)
             if found is not None and own is not None:
                 cameras[name] = {
@@ -275,7 +255,7 @@ class _Segmentation:
                     "residual_px": residual[:, k].tolist(),
                     "uncovered": record.coverage[:, k].tolist(),
                 }
-        written = [(name, found, cameras[name]["frame"]) for name, found in segments.items() if found is not None]
+        written = [(name, found, cameras[name]["frame"]) for name, found in self._segments.items() if found is not None]
         list(self._pool.map(lambda item: self._write_masks(*item), written))
         past = FrameSummary.of(record)
         entry: FrameEntry = {

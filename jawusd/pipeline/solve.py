@@ -25,10 +25,10 @@ from jawusd.pipeline.segment_guide import combine_guide
 from jawusd.pipeline.skin import SkinOptions
 from jawusd.pipeline.solve_report import check_page, solve_limits, write_solve_report
 from jawusd.pipeline.solve_skin import SkinOfFootage, SkinOfShot, skin_of_footage
-from jawusd.pipeline.solve_videos import VideoOptions, solve_videos
 from jawusd.pipeline.state import Progress, no_progress
 from jawusd.pipeline.subject import load_labelled, registered_meshes
 from jawusd.pipeline.track import tracking_config
+from jawusd.pipeline.videos import VideoOptions, solve_videos
 from jawusd.pipeline.workspace import open_capture
 from jawusd.rig import write_animation
 from jawusd.rig.rebake import write_over

@@ -129,7 +129,7 @@ def first_pass(
 ) -> Tracks:
     """Track both arches without a jaw model; parameters and errors are as for `track`."""
     from jawusd.pipeline.segment_guide import combine_guide
-    from jawusd.pipeline.track_videos import track_videos
+    from jawusd.pipeline.videos import track_videos
     from jawusd.tracking import track_capture
     from jawusd.tracking.region.condyle_fusion import widen_strained
 

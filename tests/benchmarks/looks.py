@@ -49,11 +49,10 @@ from jawusd.pipeline.cameras import load_cameras, open_colour_footage
 from jawusd.pipeline.fit import fit_subject
 from jawusd.pipeline.picture_search import PictureSearch, Start
 from jawusd.pipeline.solve import solve
-from jawusd.pipeline.solve_videos import PreparedTeeth, VideoOptions, VideoShot
 from jawusd.pipeline.state import no_progress
 from jawusd.pipeline.subject import load_meshes, subject_of_capture
 from jawusd.pipeline.track import track
-from jawusd.pipeline.track_videos import Follower
+from jawusd.pipeline.videos import Follower, PreparedTeeth, VideoOptions, VideoShot
 from jawusd.synthetic.anatomy import build_anatomy
 from jawusd.synthetic.person import Person
 from jawusd.synthetic.take import perform

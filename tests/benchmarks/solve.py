@@ -30,8 +30,8 @@ from jawusd.formats.performance import Performance, SolveState
 from jawusd.geometry import se3_inverse, transform_point, transform_points
 from jawusd.pipeline.cameras import load_cameras
 from jawusd.pipeline.fit import fit_subject
-from jawusd.pipeline.solve_videos import VideoOptions, solve_videos
 from jawusd.pipeline.subject import load_meshes, subject_of_capture
+from jawusd.pipeline.videos import VideoOptions, solve_videos
 from jawusd.tracking import track_capture
 from jawusd.tracking.contour.scan import prepare_scan
 from jawusd.tracking.contour.views import MaskViews

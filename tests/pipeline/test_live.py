@@ -24,9 +24,8 @@ from jawusd.pipeline.cameras import load_cameras, open_videos
 from jawusd.pipeline.live import OscSender, _Follower, live, next_instant
 from jawusd.pipeline.live_jaw import LiveFrame
 from jawusd.pipeline.skin import SkinOptions
-from jawusd.pipeline.solve_videos import PreparedTeeth
 from jawusd.pipeline.subject import load_labelled, registered_meshes
-from jawusd.pipeline.track_videos import Cutter
+from jawusd.pipeline.videos import Cutter, PreparedTeeth
 from jawusd.pipeline.workspace import open_capture
 from jawusd.segmentation.picture import ColourFootage
 from jawusd.tracking.region.live import LiveTake

@@ -20,9 +20,9 @@ from jawusd.media.video import Video
 from jawusd.pipeline.calibrate import sync_cameras
 from jawusd.pipeline.cameras import load_cameras
 from jawusd.pipeline.solve import check_output, solve, solve_summary, write_solved
-from jawusd.pipeline.solve_videos import PreparedTeeth, VideoOptions, VideoShot
 from jawusd.pipeline.state import no_progress
 from jawusd.pipeline.subject import load_meshes, registered_meshes
+from jawusd.pipeline.videos import PreparedTeeth, VideoOptions, VideoShot
 from jawusd.pipeline.workspace import open_capture
 from jawusd.rig.motion_read import read_poses_of_stage
 from jawusd.tracking.performance.coordinates import Pose

@@ -17,7 +17,7 @@ from jawusd.pipeline.picture_search import _Candidate
 from jawusd.pipeline.state import no_progress
 from jawusd.pipeline.subject import load_meshes
 from jawusd.pipeline.track import first_pass, track_summary
-from jawusd.pipeline.track_videos import track_videos
+from jawusd.pipeline.videos import track_videos
 from jawusd.tracking.region.take import footage_findings
 from jawusd.tracking.region.tracker import RegionTracker
 

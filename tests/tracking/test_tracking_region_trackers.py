@@ -14,7 +14,7 @@ from jawusd.geometry import make_transform, relative_pose
 from jawusd.pipeline.cameras import open_footage
 from jawusd.pipeline.segment_guide import known_guide, save_guide
 from jawusd.pipeline.subject import load_meshes, subject_of_capture
-from jawusd.pipeline.track_videos import Follower
+from jawusd.pipeline.videos import Follower
 from jawusd.segmentation.picture import ColourFootage
 from jawusd.tracking.contour.equations import translation
 from jawusd.tracking.contour.quality import score_px
