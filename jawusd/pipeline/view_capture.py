@@ -22,6 +22,7 @@ from jawusd.formats.tracks import Tracks, load_tracks
 from jawusd.geometry import Camera
 from jawusd.pipeline.calibrate import sync_cameras
 from jawusd.pipeline.cameras import check_same_cameras, load_cameras, open_backdrops, tracked_cameras, tracked_scans
+from jawusd.pipeline.pictures import open_wall
 from jawusd.pipeline.report import as_built, build_facts, is_build, recorded_offsets
 from jawusd.pipeline.scans import save_reviewed
 from jawusd.pipeline.state import BuildState, Progress
@@ -267,12 +268,8 @@ def _outlines(
 
     @cache
     def wall(name: str) -> CameraWall:
-        from jawusd.media.side_by_side import CameraWall
-
         sources = tuple(source for source in capture.cameras if source.name == name)
-        cameras = {camera.name: camera for camera in tracked_cameras(load_cameras(capture), tracks)}
-        backdrops = open_backdrops(capture.model_copy(update={"cameras": sources}), offsets)
-        return CameraWall({name: cameras[name]}, backdrops, tracks, scans(), tile_px)
+        return open_wall(capture.model_copy(update={"cameras": sources}), offsets, tracks, scans(), tile_px)
 
     @explain_missing_packages()
     def picture(name: str, frame: int) -> NDArray[np.uint8]:
