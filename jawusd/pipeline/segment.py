@@ -24,10 +24,9 @@ from jawusd.pipeline.state import Progress, hash_files, hash_value
 from jawusd.pipeline.subject import load_meshes, subject_of_capture
 from jawusd.pipeline.videos import Follower
 from jawusd.pipeline.workspace import input_hashes
-from jawusd.segmentation.camera import CameraSegmenter, Segment
+from jawusd.segmentation.camera import CameraSegmenter, Segment, learn_numbers
 from jawusd.segmentation.colours import ColourStates, SegmentationConfig, state_files
 from jawusd.segmentation.files import ARCHES, KeyMasks, mask_path, write_mask
-from jawusd.segmentation.learn import learn_numbers
 from jawusd.segmentation.picture import Pictures
 from jawusd.tracking.contour.frame_record import FrameRecord, FrameSummary
 from jawusd.tracking.contour.quality import view_residual_px

@@ -1,9 +1,10 @@
-"""Segment the images of one camera, frame by frame."""
+"""Segment the images of one camera, frame by frame, and learn how to from finished masks of a few frames."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import TypedDict
 
 import cv2
 import numpy as np
@@ -13,14 +14,53 @@ from jawusd.base.arrays import Array, Mask
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry import Camera, transform_points
 from jawusd.media.pixels import ColourPicture
-from jawusd.segmentation.arches import Expectation, ScanSurface, Seeds, expect_crowns
+from jawusd.segmentation.arches import (
+    Expectation,
+    ScanSurface,
+    Seeds,
+    cut_arches,
+    expect_crowns,
+    separate_arches,
+)
+from jawusd.segmentation.border import refine_borders
 from jawusd.segmentation.colours import ColourModel, SegmentationConfig
 from jawusd.segmentation.files import Key
-from jawusd.segmentation.learn import Example, cut_picture, overlap
 from jawusd.segmentation.picture import PictureFrame, Window
 
 _ARCHES = (0, 1)
 _EVERY = 20  # stride over the crown vertices; only every 20th vertex is projected to find the window
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """An image to be segmented."""
+
+    window: Window  # its part around the teeth
+    expected: Expectation  # the expected crowns in the window
+    colours: ColourModel  # colour model of the image's camera
+    px_per_mm: float  # resolution at the teeth
+
+    def cut(
+        self, config: SegmentationConfig, reach_mm: float, seeds: Seeds | None = None
+    ) -> tuple[NDArray[np.float32], Mask]:
+        """Segment both arches, refine their borders, and keep annotated pixels.
+
+        Return the coverage of both arches, shape (2, h, w), and the pixels with visible borders, shape (h, w).
+        """
+        rgb, expected, px_per_mm = self.window.rgb, self.expected, self.px_per_mm
+        shares = cut_arches(rgb, expected, self.colours, config, px_per_mm, reach_mm, seeds)
+        shares, clear = refine_borders(shares, rgb, config, px_per_mm)
+        shares = separate_arches(shares, rgb, expected, config, px_per_mm)
+        shares = _widened(shares, config.wider)
+        return (shares if seeds is None else seeds.pinned(shares)), clear
+
+
+@dataclass(frozen=True, eq=False)
+class Example:
+    """Example for learning: an image with finished masks."""
+
+    scene: Scene
+    drawn: NDArray[np.float32]  # annotated coverage of both arches, shape (2, h, w)
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,9 +77,7 @@ class Segment:
     # numbers of outline pixels of each arch: on visible edges, on no visible edge, and next to the other arch, shape
     # (2, 3)
     outline: NDArray[np.int64]
-    # the segmented window and the expected crowns
-    window: Window
-    expected: Expectation
+    window: Window  # the segmented window
 
     def only(self, arches: Mask) -> Segment:
         """Return the segmentation with the masks of only those arches that are true in `arches`, shape (2,)."""
@@ -87,26 +125,26 @@ class CameraSegmenter:
             turn: number of the iteration; 0 with predicted poses, 1 or more with refined poses.
         """
         c = self._config
-        window = self._frame.window(image, self._around(poses), c.margin_mm)
-        if window is None:
+        scene = self._scene(image, poses)
+        if scene is None:
             return None
-        expected = expect_crowns(self._scans, poses, window.camera)
-        seeds = self._seeds(window, keys)
+        seeds = self._seeds(scene.window, keys)
         if turn == 0 or not self.colours.is_trained():
-            self._learn(window, expected, keys, seeds)
+            self._learn(scene, keys, seeds)
         reach = c.reach_mm[min(turn, len(c.reach_mm) - 1)]
         # The tracker needs outlines that are consistent over time. Computed outlines are more consistent than annotated
         # outlines, so a finished mask replaces a computed mask only if the computed mask is wrong.
         drawn = seeds.share if seeds is not None and seeds.known.all() else None
         guide = None if drawn is not None else seeds
         # Refine the borders in the first iteration, too; with rough outlines, the tracker would report a lost arch.
-        shares, clear = cut_picture(window, expected, self.colours, c, self._frame.px_per_mm, reach, guide)
+        shares, clear = scene.cut(c, reach, guide)
         if drawn is not None and min(map(overlap, shares, drawn)) < c.key_overlap:
             shares = drawn
         masks = np.round(255 * shares).astype(np.uint8)
         present = np.array([(mask > 127).sum() >= c.least_px for mask in masks])
-        contrast, unexpected = self._contrast(window, masks), _unexpected(masks, expected)
-        return Segment(window.camera, masks, present, contrast, unexpected, _outline(masks, clear), window, expected)
+        contrast, unexpected = self._contrast(scene.window, masks), _unexpected(masks, scene.expected)
+        outline = _outline(masks, clear)
+        return Segment(scene.window.camera, masks, present, contrast, unexpected, outline, scene.window)
 
     def recorded(self, segment: Segment) -> list[NDArray[np.uint8]]:
         """Return the masks of both arches in recorded pixels, (H, W) uint8, 0 or 255."""
@@ -120,15 +158,20 @@ class CameraSegmenter:
 
         Return None if the annotated masks are not finished, or if the teeth are out of view.
         """
+        scene = self._scene(image, poses)
+        if scene is None:
+            return None
+        seeds = self._seeds(scene.window, keys)
+        self._learn(scene, keys, seeds)
+        return Example(scene, seeds.share) if seeds is not None and seeds.known.all() else None
+
+    def _scene(self, image: ColourPicture, poses: Array) -> Scene | None:
+        """Return an image with the crowns expected at given poses; None if the teeth are out of view."""
         window = self._frame.window(image, self._around(poses), self._config.margin_mm)
         if window is None:
             return None
         expected = expect_crowns(self._scans, poses, window.camera)
-        seeds = self._seeds(window, keys)
-        self._learn(window, expected, keys, seeds)
-        if seeds is None or not seeds.known.all():
-            return None
-        return Example(window, expected, seeds.share, self.colours, self._frame.px_per_mm)
+        return Scene(window, expected, self.colours, self._frame.px_per_mm)
 
     def _seeds(self, window: Window, keys: Sequence[Key | None]) -> Seeds | None:
         """Return the annotations of an image in a window."""
@@ -141,17 +184,17 @@ class CameraSegmenter:
                 share[r] = self._frame.given(key.mask, window) / np.float32(255)
         return Seeds(known | all(key is not None and key.finished for key in keys), share)
 
-    def _learn(self, window: Window, expected: Expectation, keys: Sequence[Key | None], seeds: Seeds | None) -> None:
+    def _learn(self, scene: Scene, keys: Sequence[Key | None], seeds: Seeds | None) -> None:
         """Update the colours with an image; annotated pixels have a higher weight."""
-        c = self._config
+        c, rgb = self._config, scene.window.rgb
         if not all(key is not None and key.finished for key in keys):
-            nearest = expected.inside_px.max(0) / self._frame.px_per_mm
-            self.colours.learn(window.rgb, nearest > c.inner_mm, nearest < -c.outer_mm)
+            nearest = scene.expected.inside_px.max(0) / scene.px_per_mm
+            self.colours.learn(rgb, nearest > c.inner_mm, nearest < -c.outer_mm)
         if seeds is not None:
             kernel = np.ones((3, 3), np.uint8)
             teeth = np.any(seeds.known & (seeds.share > 0.5), axis=0).astype(np.uint8)
             outer = np.all(seeds.known & (seeds.share <= 0.5), axis=0) & (cv2.dilate(teeth, kernel, iterations=2) == 0)
-            self.colours.learn(window.rgb, cv2.erode(teeth, kernel) > 0, outer, c.key_weight)
+            self.colours.learn(rgb, cv2.erode(teeth, kernel) > 0, outer, c.key_weight)
 
     def _contrast(self, window: Window, masks: NDArray[np.uint8]) -> Array:
         """Return the tooth probability just inside an arch's outline minus the probability just outside both arches."""
@@ -188,3 +231,77 @@ def _unexpected(masks: NDArray[np.uint8], expected: Expectation) -> Array:
         if teeth.any():
             out[r] = (teeth & (expected.inside_px[r] < 0)).sum() / teeth.sum()
     return out
+
+
+_FACTORS = (0.5, 2.0)  # factors that are tried for each weight, one weight at a time
+_NUMBERS = ("border", "place_per_mm", "rows_per_mm")
+_DOUBTS = (-1.0, 1.0)  # candidate increments of `doubt`
+_WIDER = np.arange(-6, 7) * 0.05  # candidate outward shifts of the outlines, in widths of the soft border
+_LEAST_GAIN = 0.01  # minimum relative improvement for which a change is kept
+
+
+class LearnedNumbers(TypedDict):
+    """Weights that were changed, and mean error (1 - intersection over union) before and after."""
+
+    numbers: dict[str, object]
+    disagreement: list[float]
+    pictures: int
+
+
+def learn_numbers(examples: Sequence[Example], config: SegmentationConfig) -> tuple[SegmentationConfig, LearnedNumbers]:
+    """Optimise the weights one by one for agreement with annotated masks; return them and a summary of the changes."""
+    best, cuts = config, _cuts(examples, config)
+    before = least = _disagreement(examples, cuts)
+    for trial in _trials(config):
+        changed = {name: value for name, value in vars(trial).items() if value != getattr(config, name)}
+        trial = replace(best, **changed)
+        found = _cuts(examples, trial)
+        value = _disagreement(examples, found)
+        if value < (1 - _LEAST_GAIN) * least:
+            best, cuts, least = trial, found, value
+    upper, lower = (_best_width([c[r] for c in cuts], [e.drawn[r] for e in examples]) for r in (0, 1))
+    wider = (upper, lower)
+    cuts = [_widened(cut, wider) for cut in cuts]
+    value = _disagreement(examples, cuts)
+    if value < (1 - _LEAST_GAIN) * least:
+        best, least = replace(best, wider=wider), value
+    changed = {name: value for name, value in vars(best).items() if value != getattr(config, name)}
+    return best, {"numbers": changed, "disagreement": [before, least], "pictures": len(examples)}
+
+
+def _cuts(examples: Sequence[Example], config: SegmentationConfig) -> list[NDArray[np.float32]]:
+    """Return the coverages of both arches in examples that are segmented without their masks, shape (2, h, w) each."""
+    return [example.scene.cut(config, config.reach_mm[-1])[0] for example in examples]
+
+
+def _trials(config: SegmentationConfig) -> Iterator[SegmentationConfig]:
+    for name in _NUMBERS:
+        for factor in _FACTORS:
+            yield replace(config, **{name: getattr(config, name) * factor})
+    for more in _DOUBTS:
+        yield replace(config, doubt=config.doubt + more)
+
+
+def _widened(shares: NDArray[np.float32], wider: tuple[float, float]) -> NDArray[np.float32]:
+    """Return coverages with outlines moved by fractions of the soft border's width, except between the arches."""
+    if not any(wider):
+        return shares
+    alone = shares[::-1] < 0.05
+    moved = np.where(shares > 0.02, shares + np.array(wider, np.float32)[:, None, None], shares)
+    return np.where(alone, np.clip(moved, 0, 1), shares)
+
+
+def _best_width(found: Sequence[NDArray[np.float32]], drawn: Sequence[NDArray[np.float32]]) -> float:
+    losses = [np.mean([1 - overlap(f + w, d) for f, d in zip(found, drawn, strict=True)]) for w in _WIDER]
+    return float(_WIDER[int(np.argmin(losses))])
+
+
+def _disagreement(examples: Sequence[Example], cuts: Sequence[NDArray[np.float32]]) -> float:
+    pairs = [(cut[r], e.drawn[r]) for cut, e in zip(cuts, examples, strict=True) for r in (0, 1)]
+    return float(np.mean([1 - overlap(found, drawn) for found, drawn in pairs]))
+
+
+def overlap(found: NDArray[np.float32], drawn: NDArray[np.float32]) -> float:
+    """Return the intersection over union of two coverages, shape (h, w)."""
+    a, b = found > 0.5, drawn > 0.5
+    return float((a & b).sum() / max(1, (a | b).sum()))

@@ -10,9 +10,9 @@ from jawusd.base.errors import CaptureError
 from jawusd.geometry import Camera
 from jawusd.segmentation.arches import LOWER, UPPER, Expectation, Seeds, cut_arches, cut_three_ways, separate_arches
 from jawusd.segmentation.border import refine_borders
+from jawusd.segmentation.camera import Example, Scene, learn_numbers
 from jawusd.segmentation.colours import ColourModel, ColourStates, SegmentationConfig, state_files
 from jawusd.segmentation.files import KeyMasks, mask_path, write_mask
-from jawusd.segmentation.learn import Example, learn_numbers
 from jawusd.segmentation.picture import PictureFrame, Window
 
 
@@ -234,7 +234,7 @@ def test_numbers_are_learned_from_wider_drawn_masks():
     rgb = np.clip(clean + rng.normal(0, 4, clean.shape), 0, 255).astype(np.uint8)
     window = Window(Camera("cam", (120, 90), np.eye(3), [], np.eye(4)), rgb, (0, 0))
     wide = (expected.inside_px > -1.0).astype(np.float32)
-    example = Example(window, expected, wide, taught(rgb, true.any(0)), 7.2)
+    example = Example(Scene(window, expected, taught(rgb, true.any(0)), 7.2), wide)
     config, learned = learn_numbers([example], SegmentationConfig())
     before, after = learned["disagreement"]
     assert after < 0.9 * before

@@ -28,8 +28,8 @@ from jawusd.photographs.align import (
 )
 from jawusd.photographs.solve import Bite, Contact, match, seen_outlines
 from jawusd.segmentation.arches import ScanSurface, expect_crowns
+from jawusd.segmentation.camera import Scene
 from jawusd.segmentation.colours import ColourModel, SegmentationConfig
-from jawusd.segmentation.learn import cut_picture
 from jawusd.segmentation.picture import Window
 from jawusd.segmentation.rows import tooth_rows
 from jawusd.tracking.contour.scan import prepare_scan
@@ -189,9 +189,8 @@ def automatic(picture: Array, lens: Camera, expected, px_per_mm: float) -> Array
     inside = expected.inside_px.max(axis=0) / px_per_mm
     around = inside < -config.outer_mm
     colours.learn(picture, inside > config.inner_mm, around & (inside > -config.outer_mm - config.margin_mm))
-    window = Window(lens, picture, (0, 0))
-    shares, _ = cut_picture(window, expected, colours, config, px_per_mm, config.reach_mm[-1], None)
-    return shares > 0.5
+    scene = Scene(Window(lens, picture, (0, 0)), expected, colours, px_per_mm)
+    return scene.cut(config, config.reach_mm[-1])[0] > 0.5
 
 
 def drawn_areas(lines: Array, expected: Array) -> tuple[Array, int]:
