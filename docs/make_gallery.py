@@ -37,11 +37,10 @@ from jawusd.paper.figures import condyle_figure
 from jawusd.pipeline.calibrate import sync_cameras
 from jawusd.pipeline.cameras import tracked_scans
 from jawusd.pipeline.pictures import open_wall
-from jawusd.pipeline.pose_page import write_page
 from jawusd.pipeline.report import run_paper_experiments
 from jawusd.pipeline.state import no_progress
 from jawusd.pipeline.subject import subject_of_build
-from jawusd.pipeline.view import ContactView, open_viewer, viewed_actor
+from jawusd.pipeline.view import ContactView, open_viewer, viewed_actor, write_page
 from jawusd.report.style import BLUE, VERMILION, figure_bytes
 from jawusd.rig import describe
 from jawusd.viewer.readouts import rest_places

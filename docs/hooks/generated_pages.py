@@ -17,7 +17,7 @@ import reference_files  # noqa: E402
 import reference_python  # noqa: E402
 import reference_tables  # noqa: E402
 
-from jawusd.pipeline.pose_page import write_page  # noqa: E402
+from jawusd.pipeline.view import write_page  # noqa: E402
 from jawusd.rig.layout import EXAMPLE_RIG  # noqa: E402
 
 PICTURES = ("overlay.png", "face_solver.png")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -152,7 +153,7 @@ def _learn(
 
     loaded = jawusd.load(rig, prim=prim)
     jaw = read_jaw(loaded, take)
-    jaw = jaw.at_rate(jaw_fps or jaw.fps or rate_of(rig, prim))
+    jaw = replace(jaw, fps=jaw_fps or jaw.fps or rate_of(rig, prim))
     for first, last in bites:
         jaw = jaw.with_bite(first, last)
     if face.fps is None:

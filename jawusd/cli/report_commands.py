@@ -163,7 +163,7 @@ def view(
         (page is not None and capture, None, "--page needs a rig, not a capture."),
     )
     if page is not None:
-        from jawusd.pipeline.pose_page import write_page
+        from jawusd.pipeline.view import write_page
 
         refuse_existing(page, force)
         write_page(rig, page, prim, footage=footage)

@@ -53,10 +53,6 @@ class JawTake:
     sigma_mm: Array  # standard deviation of d [mm], shape (F, 3)
     fps: float | None  # frame rate [1/s]; None if unknown
 
-    def at_rate(self, fps: float) -> JawTake:
-        """Return the take with its frame rate replaced."""
-        return replace(self, fps=fps)
-
     def with_bite(self, first: int, last: int) -> JawTake:
         """Return the take with d = 0 in the frames `first` to `last`, in which the teeth are in occlusion."""
         bite = np.arange(first, last + 1, dtype=np.float64)

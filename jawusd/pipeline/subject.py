@@ -6,7 +6,7 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -20,10 +20,6 @@ from jawusd.formats.mesh import GUM, Mesh, ScanLabels, labels_path, load_scan_la
 from jawusd.formats.model import load_model
 from jawusd.geometry import LANDMARKS, anatomical_frame, find_landmarks, landmark_frame, transform_points
 from jawusd.geometry.anatomy import MEAN_CONDYLES
-
-if TYPE_CHECKING:
-    from jawusd.meshes.scan_labels import Labelling
-
 
 TEETH = {"upper": "upper_teeth", "lower": "lower_teeth"}
 
@@ -45,7 +41,6 @@ class LabelledScan:
     mesh: Mesh  # With labels, unless painted.
     origin: Origin
     labels: ScanLabels | None  # None if the scan is painted
-    shape: Labelling | None  # result of labelling by shape, if the scan had neither paint nor labels
     findings: tuple[Finding, ...]
 
 
@@ -82,9 +77,9 @@ def _labelled(arch: str, mesh: Mesh, path: Path, file: Path | None, other: Array
         message = f"crown and gum of the {arch} scan are labelled by {file.name} ({of}){over}."
         note = Finding("scan_labels_from_file", "note", message, path=str(path))
         labelled = replace(mesh, labels=stored.labels)
-        return LabelledScan(arch, path, labelled, "file", stored, None, (note, *_weak_border(arch, stored, path)))
+        return LabelledScan(arch, path, labelled, "file", stored, (note, *_weak_border(arch, stored, path)))
     if painted is not None:
-        return LabelledScan(arch, path, mesh, "paint", None, None, ())
+        return LabelledScan(arch, path, mesh, "paint", None, ())
     return _by_shape(arch, mesh, path, other)
 
 
@@ -101,7 +96,7 @@ def _by_shape(arch: str, mesh: Mesh, path: Path, other: Array | None) -> Labelle
         kind, message = "scan_crowns_only", f"the {arch} scan has no paint and no gum; all of it counts as crown."
         hint = "If it has gum, paint it with the brush in `jawusd view`."
     findings = (Finding(kind, "note", message, path=str(path), hint=hint), *_weak_border(arch, found, path))
-    return LabelledScan(arch, path, replace(mesh, labels=found.labels), "shape", found, shape, findings)
+    return LabelledScan(arch, path, replace(mesh, labels=found.labels), "shape", found, findings)
 
 
 def _weak_border(arch: str, labels: ScanLabels, path: Path) -> tuple[Finding, ...]:

@@ -1,6 +1,7 @@
 """Faces and jaws read from files, brought to one clock, and learned from."""
 
 import json
+from dataclasses import replace
 
 import ezc3d
 import numpy as np
@@ -173,7 +174,7 @@ def test_a_face_of_another_performance_is_refused(take):
     with pytest.raises(FittingError, match="no frame has values in all columns"):
         learn_skin(person.rig, jaw, read_face_of(np.where(np.arange(40)[:, None] == 3, np.nan, X)))
     with pytest.raises(ValueError, match="frame rate"):
-        learn_skin(person.rig, jaw.at_rate(0.0), face)
+        learn_skin(person.rig, replace(jaw, fps=0.0), face)
 
 
 def read_face_of(X):

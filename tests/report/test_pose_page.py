@@ -19,7 +19,7 @@ from jawusd.evaluator.motions import motions_of_poses
 from jawusd.formats.keys import load_keys
 from jawusd.formats.poses import read_parameters
 from jawusd.geometry.se3 import transform_points
-from jawusd.pipeline.pose_page import write_page
+from jawusd.pipeline.view import write_page
 from jawusd.rig.layout import EXAMPLE_RIG
 from jawusd.rig.read import load_rig
 from jawusd.viewer.readouts import GHOSTS, nearest_captured
