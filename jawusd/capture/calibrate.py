@@ -55,7 +55,7 @@ def calibrate_capture(
     if capture.boards is None:
         raise CalibrationError(
             "has no [boards] table.",
-            path=capture.folder / "capture.toml",
+            path=capture.file,
             hint="Film a chessboard at the position of the teeth and list the clips in [boards], or set "
             "a calibration file.",
         )
@@ -76,7 +76,7 @@ def calibrate_detections(
     """
     boards = capture.boards
     if boards is None:
-        raise CalibrationError("has no [boards] table.", path=capture.folder / "capture.toml")
+        raise CalibrationError("has no [boards] table.", path=capture.file)
     points = board_points(boards)
     start = initial_cameras(
         detections.names, detections.sizes_px, detections.corners_px, points, board_symmetries(boards)

@@ -68,7 +68,7 @@ def estimate_offsets(capture: Capture) -> Alignment:
         if camera.video is None:
             raise SyncError(
                 f"camera {camera.name} has no video to search for light flashes.",
-                path=capture.folder / "capture.toml",
+                path=capture.file,
                 hint=_offsets_hint([camera.name for camera in capture.cameras]),
             )
     if capture.sync.method in ("timecode", "numbers"):

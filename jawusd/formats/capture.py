@@ -181,6 +181,11 @@ class Capture(Strict):
             )
 
     @property
+    def file(self) -> Path:
+        """Return the path of capture.toml."""
+        return self.folder / "capture.toml"
+
+    @property
     def reference(self) -> str:
         """Return the name of the reference camera: the one in [sync], otherwise the first camera."""
         return self.sync.reference or self.cameras[0].name

@@ -107,7 +107,7 @@ def _picks(capture: Capture) -> Bootstrap:
     if capture.bootstrap is None:
         raise TrackingError(
             "the capture has no [bootstrap] picks, which the paper's method requires",
-            path=capture.folder / "capture.toml",
+            path=capture.file,
             hint="Add at least three picks per arch, each seen by two cameras.",
         )
     return capture.bootstrap

@@ -216,7 +216,7 @@ def _track(run: Workspace, options: BuildOptions, offsets: dict[str, int]) -> tu
 
 def _fit(run: Workspace, options: BuildOptions) -> tuple[list[Path], FitSummary]:
     tracks = load_tracks(run.folder / FIRST_PASS)
-    with naming_file(run.capture.folder / "capture.toml"):
+    with naming_file(run.capture.file):
         subject = subject_of_capture(run.capture)
         model = fit_subject(subject, tracks, options.model, run.progress)
     path = run.folder / "model.npz"

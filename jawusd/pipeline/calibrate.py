@@ -38,7 +38,7 @@ def calibrate_boards(capture: Capture, out: Path, progress: Progress) -> Calibra
     """
     from jawusd.capture.calibrate import calibrate_capture
 
-    with naming_file(capture.folder / "capture.toml"):
+    with naming_file(capture.file):
         meshes = load_meshes(capture)
         scans = {jaw: meshes[f"{jaw}_teeth"].vertices for jaw in ("upper", "lower")}
         cameras, report = calibrate_capture(
@@ -92,7 +92,7 @@ def sync_cameras(capture: Capture, progress: Progress) -> SyncNotes:
     if (result := known_sync(capture)) is None:
         from jawusd.capture.sync import estimate_offsets
 
-        with naming_file(capture.folder / "capture.toml"):
+        with naming_file(capture.file):
             result = _sync_result(estimate_offsets(capture))
     progress("sync", 1, 1)
     return result

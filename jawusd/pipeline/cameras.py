@@ -15,7 +15,7 @@ from jawusd.formats.capture import CameraSource, Capture
 from jawusd.formats.mesh import Mesh
 from jawusd.formats.tracks import Tracks
 from jawusd.geometry import Camera
-from jawusd.pipeline.subject import load_meshes, registered_meshes
+from jawusd.pipeline.subject import load_meshes
 
 if TYPE_CHECKING:
     from jawusd.media.clip import Clip
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
 
 Size = tuple[int, int]
+_FOOTAGE_HINT = "Specify the footage there (video = ...)."
 USD_SUFFIXES = (".usd", ".usda", ".usdc", ".usdz", ".abc")
 
 
@@ -122,11 +123,8 @@ def tracked_cameras(cameras: Sequence[Camera], tracks: Tracks) -> list[Camera]:
 def _calibrated(capture: Capture) -> list[tuple[Camera, CameraSource]]:
     """Return the cameras as calibrated, each with its entry in the capture."""
     if capture.calibration is None:
-        raise CalibrationError(
-            'has no "calibration".',
-            path=capture.folder / "capture.toml",
-            hint="Specify a calibration file there; `jawusd calibrate` makes one from [boards].",
-        )
+        hint = "Specify a calibration file there; `jawusd calibrate` makes one from [boards]."
+        raise CalibrationError('has no "calibration".', path=capture.file, hint=hint)
     found = read_calibration(capture.calibration, capture.calibration_unit_mm, lambda: _recorded_sizes(capture))
     # Camera names of other programs may contain dots; names in a capture must not.
     plain = {plain_name(camera.name): camera for camera in found}
@@ -184,14 +182,10 @@ def open_videos(capture: Capture) -> dict[str, Clip]:
     """
     from jawusd.media.footage import open_clip
 
-    sources = {source.name: source.clip for source in capture.cameras if source.clip}
-    if not sources:
-        raise CaptureError(
-            "no camera has a video.",
-            path=capture.folder / "capture.toml",
-            hint="Specify the footage there (video = ...).",
-        )
-    return {name: open_clip(clip) for name, clip in sources.items()}
+    clips = {source.name: source.clip for source in capture.cameras if source.clip}
+    if not clips:
+        raise CaptureError("no camera has a video.", path=capture.file, hint=_FOOTAGE_HINT)
+    return {name: open_clip(clip) for name, clip in clips.items()}
 
 
 def open_footage(capture: Capture, tracks: Tracks | None = None) -> tuple[dict[str, Camera], dict[str, Clip]]:
@@ -222,10 +216,8 @@ def open_colour_footage(
 
     cameras, videos = open_footage(capture)
     if work is not None and len(videos) < 2:
-        raise CaptureError(
-            f"{len(videos)} of {len(capture.cameras)} cameras have a video; {work} needs at least two.",
-            path=capture.folder / "capture.toml",
-        )
+        message = f"{len(videos)} of {len(capture.cameras)} cameras have a video; {work} needs at least two."
+        raise CaptureError(message, path=capture.file)
     return {name: camera for name, camera in cameras.items() if name in videos}, ColourFootage(videos, offsets)
 
 
@@ -240,11 +232,7 @@ def open_backdrops(capture: Capture, offsets: Mapping[str, int]) -> dict[str, Ba
 
     sources = [source for source in capture.cameras if source.video or source.masks]
     if not sources:
-        raise CaptureError(
-            "no camera has a video or masks to draw over.",
-            path=capture.folder / "capture.toml",
-            hint="Specify the footage there (video = ...).",
-        )
+        raise CaptureError("no camera has a video or masks to draw over.", path=capture.file, hint=_FOOTAGE_HINT)
     return {source.name: Backdrop(source, offsets[source.name]) for source in sources}
 
 
@@ -259,5 +247,5 @@ def check_same_cameras(capture: Capture, tracks: Tracks) -> None:
 
 def tracked_scans(capture: Capture, tracks: Tracks) -> tuple[Mesh, Mesh]:
     """Return the upper and the lower scan [mm] in the registration of the tracks; raises like `load_meshes`."""
-    meshes = registered_meshes(load_meshes(capture), tracks.meta)
+    meshes = load_meshes(capture, tracks.meta)
     return meshes["upper_teeth"], meshes["lower_teeth"]

@@ -149,7 +149,7 @@ def refuse_errors(findings: Sequence[Finding], capture: Capture) -> None:
     errors = [finding for finding in findings if finding.severity == "error"]
     if not errors:
         return
-    path = capture.folder / "capture.toml"
+    path = capture.file
     if len(errors) == 1:
         only = errors[0]
         raise CaptureError(only.message, path=only.path or path, camera=only.camera, frame=only.frame, hint=only.hint)

@@ -46,7 +46,7 @@ class Parts:
     @property
     def description(self) -> str:
         """Return the path of capture.toml."""
-        return str(self.given.folder / "capture.toml")
+        return str(self.given.file)
 
     @property
     def given(self) -> Capture:

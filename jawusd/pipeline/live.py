@@ -23,7 +23,7 @@ from jawusd.pipeline.live_jaw import LiveFrame, LiveJaw, LiveSkin
 from jawusd.pipeline.picture_search import arches_apart, least_fit, orientations, rough_masks
 from jawusd.pipeline.skin import SkinOptions
 from jawusd.pipeline.state import no_progress
-from jawusd.pipeline.subject import load_labelled, registered_meshes
+from jawusd.pipeline.subject import load_meshes
 from jawusd.pipeline.videos import Cutter, PreparedTeeth, VideoOptions, VideoShot
 from jawusd.pipeline.workspace import open_capture
 from jawusd.segmentation.picture import Pictures
@@ -149,15 +149,15 @@ def next_instant(times_s: Sequence[Sequence[float]], after_s: float) -> float | 
 
 def _with_sources(capture: Capture, sources: Mapping[str, str]) -> tuple[Capture, dict[str, str]]:
     """Return the capture restricted to cameras with a source, and the sources; source files replace its videos."""
-    names, path = [camera.name for camera in capture.cameras], capture.folder / "capture.toml"
+    names = [camera.name for camera in capture.cameras]
     if unknown := sorted(set(sources) - set(names)):
         message = f"sources are given for unknown cameras {', '.join(unknown)}; the capture has {', '.join(names)}."
-        raise CaptureError(message, path=path)
+        raise CaptureError(message, path=capture.file)
     videos = {camera.name: str(camera.video) for camera in capture.cameras if camera.video is not None}
     where = dict(sources) or videos
     if not where:
         hint = "Give devices or streams with --source CAMERA=/dev/video0."
-        raise CaptureError("no camera has a video, and no source is given.", path=path, hint=hint)
+        raise CaptureError("no camera has a video, and no source is given.", path=capture.file, hint=hint)
     files = {name: Path(one) for name, one in where.items() if Path(one).is_file()}
     cameras = tuple(
         camera.model_copy(update={"video": files.get(camera.name, camera.video)})
@@ -186,9 +186,9 @@ class _Follower:
         self._offsets = dict.fromkeys(where, 0)
         if self._files:
             self._offsets = sync_cameras(self._capture, no_progress)["offsets"]
-        with naming_file(capture.folder / "capture.toml"):
+        with naming_file(capture.file):
             self._cameras = {camera.name: camera for camera in load_cameras(capture) if camera.name in where}
-            meshes = registered_meshes(load_labelled(capture)[0], jaw.meta)
+            meshes = load_meshes(capture, jaw.meta)
         self._pool = pool
         self._teeth = PreparedTeeth(self._capture, meshes, jaw, pool.map)
         cameras = tuple(self._cameras.values())

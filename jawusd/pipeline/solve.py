@@ -26,7 +26,7 @@ from jawusd.pipeline.skin import SkinOptions
 from jawusd.pipeline.solve_report import check_page, solve_limits, write_solve_report
 from jawusd.pipeline.solve_skin import SkinOfFootage, SkinOfShot, skin_of_footage
 from jawusd.pipeline.state import Progress, no_progress
-from jawusd.pipeline.subject import load_labelled, registered_meshes
+from jawusd.pipeline.subject import load_labelled
 from jawusd.pipeline.track import tracking_config
 from jawusd.pipeline.videos import VideoOptions, solve_videos
 from jawusd.pipeline.workspace import open_capture
@@ -153,10 +153,9 @@ def _from_images(
     capture: Capture, jaw: JawRig, offsets: dict[str, int], options: VideoOptions, progress: Progress
 ) -> tuple[Performance, list[Finding]]:
     """Return the performance solved from masks or images of the teeth, and findings about the scans."""
-    with naming_file(capture.folder / "capture.toml"):
+    with naming_file(capture.file):
         cameras = load_cameras(capture)
-        meshes, findings = load_labelled(capture)
-        meshes = registered_meshes(meshes, jaw.meta)
+        meshes, findings = load_labelled(capture, jaw.meta)
         if not any(camera.masks for camera in capture.cameras):
             table = {camera.name: camera for camera in cameras}
             return solve_videos(capture, table, offsets, meshes, jaw, options, progress), findings
@@ -180,9 +179,8 @@ def _from_images(
 
 def _from_skin(capture: Capture, jaw: JawRig, skin: SkinOfShot) -> tuple[Performance, list[Finding]]:
     """Return the performance estimated from facial skin alone, and findings about the scans."""
-    with naming_file(capture.folder / "capture.toml"):
-        meshes, findings = load_labelled(capture)
-        meshes = registered_meshes(meshes, jaw.meta)
+    with naming_file(capture.file):
+        meshes, findings = load_labelled(capture, jaw.meta)
     scans = prepare_scan(meshes["upper_teeth"], "upper"), prepare_scan(meshes["lower_teeth"], "lower")
     frames = range(*capture.frames) if capture.frames else skin.frames()
     return solve_by_skin(jaw, scans, skin, frames, capture.fps), findings

@@ -116,23 +116,25 @@ BONES = ("mandible", "skull")
 MESHES = ("upper_teeth", "lower_teeth", *BONES)
 
 
-def load_meshes(capture: Capture) -> dict[str, Mesh]:
+def load_meshes(capture: Capture, meta: Mapping[str, object] | None = None) -> dict[str, Mesh]:
     """Read the scans and bones of a capture [mm, scan frame], by the names in `MESHES`; bones may be missing.
 
-    The returned teeth scans have labels, unless they are painted.
+    The returned teeth scans have labels, unless they are painted. With the metadata of tracks or a model, the scans are
+    registered as in these; see `registered_meshes`.
 
     Raises:
         CaptureError: a mesh is corrupt, or its size is implausible in mm.
         FormatError: a label file is corrupt, or belongs to another version of its scan.
     """
-    return load_labelled(capture)[0]
+    return load_labelled(capture, meta)[0]
 
 
-def load_labelled(capture: Capture) -> tuple[dict[str, Mesh], list[Finding]]:
+def load_labelled(capture: Capture, meta: Mapping[str, object] | None = None) -> tuple[dict[str, Mesh], list[Finding]]:
     """Return the meshes of `load_meshes`, and findings on the labels of the teeth scans."""
     paths = {name: getattr(capture.scans, name) for name in MESHES}
     files = {name: path for name, path in paths.items() if path is not None}
-    return _read_labelled(files, capture.scans.labels)
+    meshes, findings = _read_labelled(files, capture.scans.labels)
+    return registered_meshes(meshes, meta or {}), findings
 
 
 def _read_labelled(files: Mapping[str, Path], labels: Path | None) -> tuple[dict[str, Mesh], list[Finding]]:
@@ -216,13 +218,12 @@ def subject_of_capture(capture: Capture, meshes: Mapping[str, Mesh] | None = Non
     """
     named = capture.anatomy.landmarks or {}
     known = (*LANDMARKS, *_TRAGIONS)
-    path = capture.folder / "capture.toml"
     if unknown := sorted(set(named) - set(known)):
         message = f'has the unknown landmark "{unknown[0]}"; must be one of {", ".join(known)}.'
-        raise CaptureError(f"[anatomy.landmarks] {message}", path=path)
+        raise CaptureError(f"[anatomy.landmarks] {message}", path=capture.file)
     if len(set(named) & set(_TRAGIONS)) == 1:
         message = "has only one of tragion_left and tragion_right. Give both or neither."
-        raise CaptureError(f"[anatomy.landmarks] {message}", path=path)
+        raise CaptureError(f"[anatomy.landmarks] {message}", path=capture.file)
     meshes = load_meshes(capture) if meshes is None else meshes
     return _measured(capture.name, meshes, capture.fps, capture.anatomy.T_anatomical_skull, named)
 

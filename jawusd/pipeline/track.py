@@ -31,7 +31,7 @@ from jawusd.pipeline.cameras import load_cameras, rescaled_cameras
 from jawusd.pipeline.pictures import write_overlay
 from jawusd.pipeline.segment_record import auto_masks_folder
 from jawusd.pipeline.state import Progress, no_progress
-from jawusd.pipeline.subject import load_labelled, load_meshes, registered_meshes, subject_of_capture
+from jawusd.pipeline.subject import load_labelled, load_meshes, subject_of_capture
 from jawusd.pipeline.workspace import open_capture
 
 if TYPE_CHECKING:
@@ -133,7 +133,7 @@ def first_pass(
     from jawusd.tracking import track_capture
     from jawusd.tracking.region.condyle_fusion import widen_strained
 
-    with naming_file(capture.folder / "capture.toml"):
+    with naming_file(capture.file):
         cameras, (meshes, findings) = load_cameras(capture), load_labelled(capture)
         given = capture, cameras, offsets, meshes["upper_teeth"], meshes["lower_teeth"]
         report = partial(progress, "track")
@@ -172,8 +172,8 @@ def model_pass(
     jaw = JawRig(model.arrays, model.meta)
     if not any(camera.masks for camera in capture.cameras):
         return weigh_with_model(tracks, jaw)
-    with naming_file(capture.folder / "capture.toml"):
-        meshes = registered_meshes(load_meshes(capture), tracks.meta)
+    with naming_file(capture.file):
+        meshes = load_meshes(capture, tracks.meta)
         return refine_tracks(
             tracks,
             jaw,

@@ -26,7 +26,7 @@ from jawusd.pipeline.pictures import open_wall
 from jawusd.pipeline.report import as_built, build_facts, is_build, recorded_offsets
 from jawusd.pipeline.scans import save_reviewed
 from jawusd.pipeline.state import BuildState, Progress
-from jawusd.pipeline.subject import load_meshes, registered_meshes, subject_of_capture
+from jawusd.pipeline.subject import load_meshes, subject_of_capture
 from jawusd.pipeline.view import CAPTURE_FILE
 from jawusd.pipeline.workspace import open_capture
 
@@ -88,9 +88,9 @@ def viewed_capture(
         capture = as_built(capture, build)
     poses = _poses(capture, tracks)
     cameras = [] if capture.calibration is None else load_cameras(capture)
-    meshes = load_meshes(capture)
+    meshes = load_meshes(capture, poses and poses.meta)
     if poses is not None:
-        cameras, meshes = tracked_cameras(cameras, poses), registered_meshes(meshes, poses.meta)
+        cameras = tracked_cameras(cameras, poses)
     offsets = _offsets(capture, build, progress)
     backdrops = open_backdrops(capture, offsets)
     by_name = {camera.name: camera for camera in cameras}
