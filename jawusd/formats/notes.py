@@ -140,11 +140,13 @@ class CalibrationNotes(TypedDict):
 
     cameras: dict[str, CameraFigures]
     views: int  # number of board poses used
-    board_shape: dict[str, float]  # `capture.scale.ShapeError` of corners near the mouth
+    #: absolute errors of distances between corners near the mouth [mm]: "mean", "p95", "max", and the number of
+    #: "distances"; 0 if no corner near the mouth was visible to two cameras
+    board_shape: dict[str, float]
     expected_shape_mm: float  # mean error of distances in the mouth that the scatter of the corners implies
     mouth_mm: tuple[float, float, float]  # centre of the mouth in world coordinates
     mouth_from: str  # text that names the source of mouth_mm
-    #: `capture.scale.ScaleCheck` of the board's square size against the size of the teeth
+    #: `capture.calibrate.ScaleCheck` of the board's square size against the size of the teeth
     scale: dict[str, float | str | None]
     advice: list[str]  # possible improvements of the calibration, one sentence each
     notes: list[str]  # assumptions of the calibration, one sentence each

@@ -19,7 +19,7 @@ from jawusd.pipeline.state import Progress
 from jawusd.pipeline.subject import load_meshes
 
 if TYPE_CHECKING:
-    from jawusd.capture.scale import ScaleCheck
+    from jawusd.capture.calibrate import ScaleCheck
     from jawusd.capture.sync import Alignment
 
 PLOT_SUFFIXES = (".png", ".svg")
@@ -55,7 +55,7 @@ def _scale_by_masks(
     capture: Capture, meshes: Mapping[str, Mesh], cameras: list[Camera], by_picks: ScaleCheck, progress: Progress
 ) -> ScaleCheck:
     """Return the scale of the teeth estimated from the masks, to verify the stated size of the calibration board."""
-    from jawusd.capture.scale import ScaleCheck, checked_scale
+    from jawusd.capture.calibrate import ScaleCheck, checked_scale
     from jawusd.tracking.initialization.scale_search import seen_size
 
     if capture.boards is None or sum(camera.masks is not None for camera in capture.cameras) < 2:
