@@ -12,7 +12,7 @@ import shutil
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
-from importlib.metadata import PackageNotFoundError, metadata, requires, version
+from importlib.metadata import metadata, requires
 from importlib.util import find_spec
 from pathlib import Path
 from typing import NamedTuple, TypedDict
@@ -24,7 +24,7 @@ from jawusd.formats.capture import Capture, read_capture
 from jawusd.formats.finding import Finding, Severity
 from jawusd.pipeline.check_files import Parts, boards, bone_findings, calibration, clips, found_error, occlusion, scans
 from jawusd.pipeline.check_views import frames, masks, picks, synchronisation, views
-from jawusd.pipeline.state import Progress, no_progress
+from jawusd.pipeline.state import Progress, installed_version, no_progress
 
 # Packages required by the stages, and packages required only by the report.
 _NEEDED = ("av", "cv2", "numba", "scipy", "torch", "onnx", "shapely", "trimesh", "pyfqmr", "PIL")
@@ -184,7 +184,7 @@ def examine() -> Examined:
     given = metadata("jawusd").get_all("Provides-Extra") or []
     extras = {name: _required(name) for name in given if name not in ("all", "test")}
     names = sorted({name for packages in extras.values() for name in packages} | set(_required("")))
-    versions = {name: _version(name) for name in names}
+    versions = {name: installed_version(name) for name in names}
     lacking = {extra: [name for name in packages if not versions[name]] for extra, packages in extras.items()}
     problems = []
     if lacking.get("build"):
@@ -221,13 +221,6 @@ def _required(extra: str) -> list[str]:
         if wanted and name.lower() != "jawusd":
             out.append(name)
     return out
-
-
-def _version(name: str) -> str:
-    try:
-        return version(name)
-    except PackageNotFoundError:
-        return ""
 
 
 def _graphics() -> str:

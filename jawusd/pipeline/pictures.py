@@ -139,7 +139,7 @@ def write_plates(
     from jawusd.rig.cameras import LIGHT_PLATE, PLATE
 
     cameras, videos = open_footage(capture)
-    light = {name for name, video in videos.items() if isinstance(video, PictureSequence) and video.is_fractional}
+    light = {n: video for n, video in videos.items() if isinstance(video, PictureSequence) and video.is_fractional}
     patterns = {name: (LIGHT_PLATE if name in light else PLATE).format(name=name) for name in videos}
     done, total = 0, len(videos) * len(frames)
     for name, video in videos.items():
@@ -147,15 +147,12 @@ def write_plates(
         files = str(folder / patterns[name])
         make_folder(Path(files).parent)
         wanted = [video.timeline.picture(frame - offsets[name]) for frame in frames.tolist()]
-        if isinstance(video, PictureSequence) and name in light:
-            for frame, index in zip(frames.tolist(), wanted):
+        images = video.pictures(wanted, colour="rgb")  # decoded only when they are asked for
+        for frame, index in zip(frames.tolist(), wanted, strict=True):
+            if name in light:
                 if index is not None:
-                    plates.write_light(files % frame, video.light(index))
-                done += 1
-                progress("plates", done, total)
-            continue
-        for frame, image in zip(frames.tolist(), video.pictures(wanted, colour="rgb")):
-            if image is not None:
+                    plates.write_light(files % frame, light[name].light(index))
+            elif (image := next(images)) is not None:
                 plates.write(files % frame, image)
             done += 1
             progress("plates", done, total)

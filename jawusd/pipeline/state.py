@@ -289,10 +289,13 @@ def recorded_origin(result: Mapping[str, object]) -> Origin:
 
 def package_versions() -> dict[str, str]:
     """Return the versions of jawusd, of Python and of the packages that results depend on."""
-    found = {"jawusd": __version__, "Python": platform.python_version()}
-    for name in _PACKAGES:
-        try:
-            found[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:
-            found[name] = "not installed"
-    return found
+    found = {name: installed_version(name) or "not installed" for name in _PACKAGES}
+    return {"jawusd": __version__, "Python": platform.python_version(), **found}
+
+
+def installed_version(name: str) -> str:
+    """Return the version of a package; "" if it is not installed."""
+    try:
+        return metadata.version(name)
+    except metadata.PackageNotFoundError:
+        return ""
