@@ -1,4 +1,4 @@
-"""Both arches in one image: projected crowns, and the three-way cut with costs from colour, position and edges."""
+"""Both arches in one image: projected crowns, cut with costs from colour, position and edges, and refined borders."""
 
 from __future__ import annotations
 
@@ -13,8 +13,7 @@ from jawusd.base.arrays import Array, Mask
 from jawusd.formats.mesh import Mesh, crown_face_mask
 from jawusd.geometry import Camera, transform_points
 from jawusd.meshes.raster import draw_depth_labels
-from jawusd.segmentation.border import ARCH_BLUR_PX, signed_distance
-from jawusd.segmentation.colours import ColourModel, SegmentationConfig
+from jawusd.segmentation.colours import ColourModel, SegmentationConfig, log_chroma
 
 OTHER, UPPER, LOWER = 0, 1, 2
 _TAU = _SIGMA = 0.35  # step sizes tau and sigma of the primal-dual iteration, which converges if 8 tau sigma < 1
@@ -55,7 +54,7 @@ def expect_crowns(scans: tuple[ScanSurface, ScanSurface], poses: Array, camera: 
         points = np.column_stack([camera.project_pinhole(world), camera.depth(world)]).astype(np.float32)
         draw_depth_labels(points, scan.gum_faces, 0, 0, False, inverse_depth, labels, OTHER)
         draw_depth_labels(points, scan.crown_faces, 0, 0, False, inverse_depth, labels, label)
-    away = np.stack([signed_distance(labels == label) for label in (UPPER, LOWER)])
+    away = np.stack([_signed_distance(labels == label) for label in (UPPER, LOWER)])
     return Expectation(labels, np.where(away > 0, away - np.float32(0.5), away + np.float32(0.5)))
 
 
@@ -228,7 +227,7 @@ def separate_arches(
     start = np.stack([np.zeros_like(upper), upper, ~upper]).astype(np.float32)
     prices = _edge_prices(rgb[box], config, open_px)
     found = cut_three_ways(cost, prices, start, open_px, config.arch_steps)
-    share = cv2.GaussianBlur(found[UPPER], (0, 0), ARCH_BLUR_PX)
+    share = cv2.GaussianBlur(found[UPPER], (0, 0), _ARCH_BLUR_PX)
     out = shares.copy()
     near = cv2.dilate(open_px.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
     for r, part in ((0, share), (1, 1 - share)):
@@ -250,3 +249,90 @@ def _edge_prices(rgb: NDArray[np.uint8], config: SegmentationConfig, where: Mask
     out[0, :, :-1] *= low + (1 - low) * np.exp(-squares[0] / scale)
     out[1, :-1] *= low + (1 - low) * np.exp(-squares[1] / scale)
     return out
+
+
+_EVEN = 1e-4  # variance added to the variance of the log colours [-], for errors of half an 8-bit step
+_FEWEST = 100  # minimum number of pixels near the border for estimating the covariance of colours
+_ARCH_BLUR_PX = 0.8  # sigma of the blur that makes the coverage fractional at the border between the arches
+_FAR_BLUR_PX = 2.0  # sigma of the blur that assigns tooth pixels far from both arches to the nearer arch
+
+
+def refine_borders(
+    shares: NDArray[np.float32], rgb: NDArray[np.uint8], config: SegmentationConfig, px_per_mm: float
+) -> tuple[NDArray[np.float32], Mask]:
+    """Return coverages (2, h, w) with soft borders, 0.5 at the outline, and a mask of visible borders, shape (h, w).
+
+    Pixels along the border are reclassified by Fisher's discriminant between the local mean colours on both sides
+    (local region statistics, Lankton & Tannenbaum 2008), since the midpoint between tooth and surrounding colour varies
+    locally. Invisible borders are not moved; parts with hardly any visible border are discarded.
+    """
+    colours = _blurred(log_chroma(rgb), config.border_blur_px)
+    band, window = config.border_band_mm * px_per_mm, 2 * round(config.border_side_mm * px_per_mm) + 1
+    inside = _signed_distance(shares.sum(0) > 0.5)
+    sides = _compare_sides(inside, colours, window)
+    if sides is None:
+        return shares, np.zeros(rgb.shape[:2], bool)
+    share, contrast = sides
+    clear = contrast > config.border_contrast
+    moved = clear & (np.abs(inside) < band)
+    teeth = np.where(moved, np.clip(share, 0, 1), inside > 0).astype(np.float32)
+    teeth[_spurious(teeth > 0.5, clear, config)] = 0.0
+    near = [_blurred(arch, _ARCH_BLUR_PX) for arch in shares]
+    far = [_blurred(arch, _FAR_BLUR_PX) for arch in shares]
+    upper, lower = np.where(near[0] + near[1] > 0.2, near, far)
+    teeth = _blurred(teeth, config.border_blur_px)
+    return teeth * np.stack([upper, lower]) / np.maximum(upper + lower, 1e-6), clear
+
+
+def _blurred(image: NDArray[np.float32], sigma_px: float) -> NDArray[np.float32]:
+    return np.asarray(cv2.GaussianBlur(image, (0, 0), sigma_px), np.float32)
+
+
+def _signed_distance(region: Mask) -> NDArray[np.float32]:
+    """Return the signed distance to a region's outline, positive inside [px]; a large negative value if empty."""
+    if not region.any():
+        return np.full(region.shape, -1e3, np.float32)
+    inner = cv2.distanceTransform(region.astype(np.uint8), cv2.DIST_L2, 5)
+    return inner - cv2.distanceTransform((~region).astype(np.uint8), cv2.DIST_L2, 5)
+
+
+def _compare_sides(
+    inside: NDArray[np.float32], colours: NDArray[np.float32], window: int
+) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
+    """Compare every pixel with the local mean colours on both sides of the border; None if one side is empty.
+
+    Return the tooth coverage, 0.5 midway between the sides, and the separation of their colours in standard deviations,
+    0 unless both sides are nearby; shape (h, w) each.
+    """
+    near = np.abs(inside) < window / 2
+    sides = ((inside > 1) & near, (inside < -1) & near)
+    means = [_mean_near(side, colours, window) for side in sides]
+    rest = [(colours - mean)[side] for (mean, _), side in zip(means, sides, strict=True)]
+    if min(map(len, rest)) < _FEWEST:
+        return None
+    precision = np.linalg.inv(np.cov(np.concatenate(rest).T) + _EVEN * np.eye(3)).astype(np.float32)
+    (tooth, has_tooth), (other, has_other) = means
+    apart = tooth - other
+    direction = apart @ precision
+    contrast = (direction * apart).sum(2)
+    share = 0.5 + (direction * (colours - (tooth + other) / 2)).sum(2) / np.maximum(contrast, 1e-6)
+    return share, np.where(has_tooth & has_other, np.sqrt(np.maximum(contrast, 0)), 0)
+
+
+def _mean_near(side: Mask, colours: NDArray[np.float32], window: int) -> tuple[NDArray[np.float32], Mask]:
+    """Return the local mean colour of one side at every pixel, and a mask of pixels with enough of this side nearby."""
+    weight = side.astype(np.float32)
+    count = cv2.boxFilter(weight, -1, (window, window), normalize=False)
+    total = cv2.boxFilter(colours * weight[..., None], -1, (window, window), normalize=False)
+    return np.asarray(total / np.maximum(count, 1)[..., None], np.float32), np.asarray(count >= window)
+
+
+def _spurious(teeth: Mask, clear: Mask, config: SegmentationConfig) -> Mask:
+    """Return a mask of specks and of parts with hardly any visible border, shape (h, w)."""
+    count, parts, stats, _ = cv2.connectedComponentsWithStats(teeth.astype(np.uint8))
+    outline = teeth & (cv2.erode(teeth.astype(np.uint8), np.ones((3, 3), np.uint8)) == 0)
+    length = np.bincount(parts[outline], minlength=count)
+    founded = np.bincount(parts[outline & clear], minlength=count)
+    bad = (founded < config.founded_share * length) | (stats[:, cv2.CC_STAT_AREA] < config.speck_px)
+    bad[0] = False
+    return bad[parts]

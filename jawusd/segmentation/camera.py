@@ -20,9 +20,9 @@ from jawusd.segmentation.arches import (
     Seeds,
     cut_arches,
     expect_crowns,
+    refine_borders,
     separate_arches,
 )
-from jawusd.segmentation.border import refine_borders
 from jawusd.segmentation.colours import ColourModel, SegmentationConfig
 from jawusd.segmentation.files import Key
 from jawusd.segmentation.picture import PictureFrame, Window

@@ -8,8 +8,16 @@ from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 
 from jawusd.base.errors import CaptureError
 from jawusd.geometry import Camera
-from jawusd.segmentation.arches import LOWER, UPPER, Expectation, Seeds, cut_arches, cut_three_ways, separate_arches
-from jawusd.segmentation.border import refine_borders
+from jawusd.segmentation.arches import (
+    LOWER,
+    UPPER,
+    Expectation,
+    Seeds,
+    cut_arches,
+    cut_three_ways,
+    refine_borders,
+    separate_arches,
+)
 from jawusd.segmentation.camera import Example, Scene, learn_numbers
 from jawusd.segmentation.colours import ColourModel, ColourStates, SegmentationConfig, state_files
 from jawusd.segmentation.files import KeyMasks, mask_path, write_mask
