@@ -12,7 +12,6 @@ from typing_extensions import TypedDict
 from jawusd.base.arrays import Array
 from jawusd.base.errors import RigError
 from jawusd.evaluator import JawRig
-from jawusd.evaluator.contact import ContactField
 from jawusd.formats.mesh import Mesh
 from jawusd.formats.model import JawModel
 from jawusd.formats.report import ContactPicture
@@ -113,36 +112,33 @@ def with_tooth_contact(
     With `regauge`, d1 is shifted so that the teeth touch at d1 = 0, where the bound then ends.
     """
     from jawusd.fitting.glide import follow_teeth
-    from jawusd.meshes.contact import sample_field
 
     if isinstance(teeth, str):
-        return _with_reason(model, "contact", teeth)
+        return _measured(model, "contact", teeth, "teeth")
     progress("contact", 0, 3)
     if regauge:
         model = follow_teeth(model, teeth)
     progress("contact", 1, 3)
-    field = sample_field(teeth, JawRig(model.arrays, model.meta))
+    model = _measured(model, "contact", teeth, "teeth")
     progress("contact", 2, 3)
-    return _with_field(model, "contact", field, field.arrays("teeth"))
+    return model
 
 
 def with_condyle_contact(model: JawModel, joints: Surfaces | str, progress: Progress = no_progress) -> JawModel:
     """Return the model with clearances of `condyle_solids` added; ``meta["joints"]`` summarises them."""
-    from jawusd.meshes.contact import JOINT_STEP_MM, sample_field
+    from jawusd.meshes.contact import JOINT_STEP_MM
 
-    if isinstance(joints, str):
-        model = _with_reason(model, "joints", joints)
-    else:
-        field = sample_field(joints, JawRig(model.arrays, model.meta), JOINT_STEP_MM, np.inf)
-        model = _with_field(model, "joints", field, field.arrays("condyles"))
+    model = _measured(model, "joints", joints, "condyles", JOINT_STEP_MM, np.inf)
     progress("contact", 3, 3)
     return model
 
 
-def _with_reason(model: JawModel, name: str, reason: str) -> JawModel:
-    return replace(model, meta={**model.meta, name: ContactSummary(missing=reason)})
+def _measured(model: JawModel, name: str, solids: Surfaces | str, parts: str, *sampling: float) -> JawModel:
+    """Return the model with the clearances of some parts, or with the reason why they could not be measured."""
+    from jawusd.meshes.contact import sample_field
 
-
-def _with_field(model: JawModel, name: str, field: ContactField, arrays: dict[str, Array]) -> JawModel:
+    if isinstance(solids, str):
+        return replace(model, meta={**model.meta, name: ContactSummary(missing=solids)})
+    field = sample_field(solids, JawRig(model.arrays, model.meta), *sampling)
     found = ContactSummary(closed_mm=field.closed_mm, error_mm=field.error_mm, limit_mm=field.limit_mm)
-    return replace(model, meta={**model.meta, name: found}, arrays={**model.arrays, **arrays})
+    return replace(model, meta={**model.meta, name: found}, arrays={**model.arrays, **field.arrays(parts)})

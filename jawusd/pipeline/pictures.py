@@ -23,7 +23,6 @@ from jawusd.pipeline.cameras import (
     load_cameras,
     open_backdrops,
     open_footage,
-    open_videos,
     tracked_cameras,
     tracked_scans,
 )
@@ -39,17 +38,6 @@ _MOST_CAMERAS = 4
 _REPORT_TILE_PX = (400, 225)
 _QUALITY = 82
 _MOST_FACES = 6000  # maximum number of faces of a mesh in the report's replay
-
-
-def draw_worst_frames(capture: Capture, offsets: Mapping[str, int], tracks: Tracks) -> tuple[Overlay, ...]:
-    """Draw the scans over the footage in the worst frames, worst first, and in a typical frame.
-
-    Raises:
-        CaptureError, CalibrationError: see `open_footage`.
-        FormatError: the tracks belong to another capture.
-    """
-    check_same_cameras(capture, tracks)
-    return draw_frames(capture, offsets, tracks, chosen_frames(tracks, capture.fps), open_videos(capture))
 
 
 def draw_frames(

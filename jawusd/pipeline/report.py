@@ -21,10 +21,10 @@ from jawusd.formats.model import JawModel, load_model
 from jawusd.formats.notes import SyncNotes
 from jawusd.formats.report import BuildVerdict, CameraFacts, Origin, Overlay, ReportData, RigFacts
 from jawusd.formats.tracks import Tracks, load_tracks
-from jawusd.pipeline.cameras import load_cameras
+from jawusd.pipeline.cameras import check_same_cameras, load_cameras, open_videos
 from jawusd.pipeline.contact import contact_pictures
 from jawusd.pipeline.fit import Poses, fit_summary
-from jawusd.pipeline.pictures import draw_worst_frames, replay_parts
+from jawusd.pipeline.pictures import chosen_frames, draw_frames, replay_parts
 from jawusd.pipeline.scans import with_stored_labels
 from jawusd.pipeline.state import (
     BUILD_FILE,
@@ -97,7 +97,9 @@ def write_build_report(
     unmet, unseen = list[str](), list[str]()
 
     def draw() -> tuple[Overlay, ...]:
-        return draw_worst_frames(facts.given(), recorded_offsets(facts.state), tracks)
+        capture, chosen = facts.given(), chosen_frames(tracks, facts.given().fps)
+        check_same_cameras(capture, tracks)
+        return draw_frames(capture, recorded_offsets(facts.state), tracks, chosen, open_videos(capture))
 
     with ThreadPoolExecutor(1) as pool:  # decoding, drawing and measuring images releases the GIL
         drawn = pool.submit(attempt, "images of the footage", unseen, draw)

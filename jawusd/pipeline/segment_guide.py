@@ -15,11 +15,11 @@ from jawusd.formats.atomic import write_npz_atomic
 from jawusd.formats.capture import Capture
 from jawusd.formats.finding import Finding
 from jawusd.formats.tracks import Tracks
-from jawusd.geometry import relative_pose, se3_inverse, transform_points
+from jawusd.geometry import se3_inverse, transform_points
 from jawusd.pipeline.segment_record import auto_masks_folder
 from jawusd.pipeline.subject import registration_of
 from jawusd.tracking.region.tracker import RegionPose
-from jawusd.tracking.sequence.smoothing import combine
+from jawusd.tracking.sequence.smoothing import combine, relative_poses
 
 # Distance [mm] between the jaw poses from masks and from colours above which one of them must be wrong; correct poses
 # of three takes differed by at most 0.9 mm. Fractions of wrong or lost frames above which a take is reported as partly
@@ -100,10 +100,7 @@ def combine_guide(capture: Capture, tracks: Tracks, landmarks: Array) -> tuple[T
 
 def _disagreement(tracks: Tracks, poses: Array, points: Array) -> list[Finding]:
     """Return a finding if, in too many frames, masks and colours disagree on points (N, 3) of the lower teeth."""
-    relative = np.full((len(poses), 4, 4), np.nan)
-    both = np.isfinite(poses).all((1, 2, 3))
-    relative[both] = relative_pose(poses[both, 0], poses[both, 1])
-    away = transform_points(tracks.raw_T_upper_lower, points) - transform_points(relative, points)
+    away = transform_points(tracks.raw_T_upper_lower, points) - transform_points(relative_poses(poses), points)
     apart_mm = np.linalg.norm(away, axis=-1).mean(-1)
     bad = ~(apart_mm <= _APART_MM)  # the distance is NaN where an arch is lost
     share = float(bad.mean())

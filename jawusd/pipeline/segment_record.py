@@ -6,7 +6,7 @@ import contextlib
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import NotRequired, TypedDict, cast
+from typing import TYPE_CHECKING, NotRequired, TypedDict, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,9 @@ from jawusd.formats.capture_parts import Masks
 from jawusd.formats.text import read_text
 from jawusd.formats.tracks import LOST
 from jawusd.pipeline.state import hash_value
+
+if TYPE_CHECKING:
+    from jawusd.segmentation.camera import LearnedNumbers
 
 RECORD, SUMMARY, SHEET, LEARNED = "segment.jsonl", "segment.json", "look_at_these.png", "learned.json"
 FORMAT = "jawusd-segment/1"
@@ -81,13 +84,6 @@ class MaskConfidence(TypedDict):
     reason: str
 
 
-class Learned(TypedDict):
-    """Result of learning from drawn masks: their number, and the disagreement with them before and after learning."""
-
-    pictures: int
-    disagreement: list[float]
-
-
 class SegmentSummary(TypedDict):
     """Contents of segment.json."""
 
@@ -95,7 +91,7 @@ class SegmentSummary(TypedDict):
     capture: str
     masks: dict[str, dict[str, str]]
     frames: int
-    learned: Learned | None
+    learned: LearnedNumbers | None
     look_at: list[MaskConfidence]
     sheet: str | None
     confidence: NotRequired[list[MaskConfidence]]
@@ -266,7 +262,7 @@ def write_summary(capture: Capture, entries: Mapping[int, FrameEntry], folder: P
     return summary
 
 
-def _learned(path: Path) -> Learned | None:
+def _learned(path: Path) -> LearnedNumbers | None:
     """Return the result of learning from drawn masks; None if no masks were drawn."""
     if not path.exists():
         return None

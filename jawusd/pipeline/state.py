@@ -37,7 +37,6 @@ LOCK_FILE = ".jawusd-lock"
 CALIBRATION = "calibration.toml"  # calibration that the build writes if the capture names none
 LABELS = "labels"  # folder to which the build writes labels of scans that have neither paint nor labels
 FIRST_PASS = "first_pass.npz"  # tracks without the model as a prior, to which the model is fitted
-_CHUNK_BYTES = 1 << 20
 _ENDING_S = 2.0  # time to wait for a lock [s]; a killed build holds its lock until the system has freed its memory
 _MOST_BYTES = 64 << 20  # maximum size of build.json [bytes]; it lists every mask file of a take
 _SHA256 = re.compile(r"[0-9a-f]{64}")
@@ -61,8 +60,7 @@ def hash_files(paths: Iterable[Path]) -> str:
         check_input(path)
         total.update(os.fsencode(path.name) + b"\0")
         with open(path, "rb") as handle:
-            while chunk := handle.read(_CHUNK_BYTES):
-                total.update(chunk)
+            hashlib.file_digest(handle, lambda: total)
         total.update(b"\1")
     return total.hexdigest()
 
