@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from typing_extensions import TypedDict
 
 from jawusd.base.arrays import Array
-from jawusd.base.errors import FormatError, explain_missing_packages
+from jawusd.base.errors import FormatError, explain_missing_packages, naming_file
 from jawusd.formats.model import JawModel
 from jawusd.formats.poses import read_poses
 from jawusd.formats.tracks import Tracks, load_tracks
@@ -167,19 +167,21 @@ def read_trajectory(
         FormatError: the file is invalid, an option does not apply to it, or the rest frame is missing or has no pose.
         MissingDependencyError: the file is HDF5, and h5py is not installed.
     """
-    path, fps = Path(path), None
+    with naming_file(path):
+        return _trajectory(Path(path), options)
+
+
+def _trajectory(path: Path, options: TrajectoryOptions) -> tuple[NDArray[np.int64], Array, float | None]:
+    fps = None
     if options.rigid:
         if options.columns or options.group:
-            raise FormatError("columns and groups apply to poses; this is a table of markers.", path=path)
+            raise FormatError("columns and groups apply to poses; this is a table of markers.")
         T, fps = marker_poses(path, options.rigid, options.rest_frame, options.length_unit)
         frames = np.arange(len(T))
     elif path.suffix.lower() in HDF5_SUFFIXES:
         if options.rest_frame is None:
-            raise FormatError(
-                "its poses are those of landmarks on the mandible, not of a scan.",
-                path=path,
-                hint="Give a frame (counted from 0) with the teeth in occlusion with --rest-frame.",
-            )
+            hint = "Give a frame (counted from 0) with the teeth in occlusion with --rest-frame."
+            raise FormatError("its poses are those of landmarks on the mandible, not of a scan.", hint=hint)
         frames, T = read_hdf5(path, options.group)
     else:
         frames, T = read_poses(path, options.columns)
@@ -187,18 +189,18 @@ def read_trajectory(
     if options.invert:
         T = se3_inverse(T)
     if options.rest_frame is not None:
-        T = T @ se3_inverse(_pose_at(frames, T, options.rest_frame, path))
+        T = T @ se3_inverse(_pose_at(frames, T, options.rest_frame))
     return frames, T, fps
 
 
-def _pose_at(frames: NDArray[np.int64], T: Array, wanted: int, path: Path) -> Array:
+def _pose_at(frames: NDArray[np.int64], T: Array, wanted: int) -> Array:
     rows = np.flatnonzero(frames == wanted)
     if not rows.size:
         between = f"; it has frames {frames.min()} to {frames.max()}" if len(frames) else ""
-        raise FormatError(f"has no frame {wanted}{between}.", path=path)
+        raise FormatError(f"has no frame {wanted}{between}.")
     found = T[rows[0]]
     if not np.isfinite(found).all():
-        raise FormatError(f"frame {wanted} has no pose.", path=path, hint="Choose another frame in occlusion.")
+        raise FormatError(f"frame {wanted} has no pose.", hint="Choose another frame in occlusion.")
     return found
 
 
@@ -213,87 +215,86 @@ def read_hdf5(path: str | os.PathLike[str], group: str | None = None) -> Poses:
         FormatError: the file is invalid, lacks the group, has data sets of wrong shapes, or poses that are not rigid.
         MissingDependencyError: h5py is not installed.
     """
+    with naming_file(path):
+        return _hdf5(Path(path), group)
+
+
+def _hdf5(path: Path, group: str | None) -> Poses:
     import h5py
 
-    path = Path(path)
     if not path.is_file():
-        raise FormatError("there is no such file.", path=path)
+        raise FormatError("there is no such file.")
     try:
         with h5py.File(path, "r") as file:
             inside = [name for name in file if isinstance(file.get(name, getlink=True), h5py.HardLink)]
             groups = [name for name in inside if isinstance(file[name], h5py.Group) and "translations" in file[name]]
-            name = _chosen(groups, group, path)
+            name = _chosen(groups, group)
+            where = f'group "{name}"'
             t, rotations, whole = (
-                _data(file[name], key, name, path) for key in ("translations", "rotations", "transformations")
+                _data(file[name], key, where) for key in ("translations", "rotations", "transformations")
             )
             unit = file[name].attrs.get("unit", "mm")
     # h5py raises exceptions of many types for corrupt files.
     except (OSError, RuntimeError, LookupError, ValueError, TypeError, AttributeError, MemoryError) as error:
-        raise FormatError(f"is not a readable HDF5 file ({error!s:.200}).", path=path) from error
+        raise FormatError(f"is not a readable HDF5 file ({error!s:.200}).") from error
     unit = unit.decode(errors="replace") if isinstance(unit, bytes) else str(unit)
     if unit not in _HDF5_UNITS_MM:
-        raise FormatError(f'group "{name}": unit is "{unit}"; must be one of {", ".join(_HDF5_UNITS_MM)}.', path=path)
-    T = _poses(t, rotations, whole, name, path)
+        raise FormatError(f'{where}: unit is "{unit}"; must be one of {", ".join(_HDF5_UNITS_MM)}.')
+    T = _poses(t, rotations, whole, where)
     T[:, :3, 3] *= _HDF5_UNITS_MM[unit]
     T[~np.isfinite(T).all((1, 2))] = np.nan
     defect = rigidity_defect(np.where(np.isfinite(T), T, np.eye(4)))
     if len(T) and defect.max() > _RIGID_TOLERANCE:
         raise FormatError(
-            f'group "{name}", row {int(defect.argmax()) + 1}: the pose is not rigid (deviation {defect.max():.2g}; '
-            f"at most {_RIGID_TOLERANCE:g} is allowed).",
-            path=path,
+            f"{where}, row {int(defect.argmax()) + 1}: the pose is not rigid (deviation {defect.max():.2g}; "
+            f"at most {_RIGID_TOLERANCE:g} is allowed)."
         )
     return np.arange(len(T)), T
 
 
-def _chosen(groups: list[str], wanted: str | None, path: Path) -> str:
+def _chosen(groups: list[str], wanted: str | None) -> str:
     known = ", ".join(groups) or "none"
     if wanted is None:
         if RAW_GROUP in groups:
             return RAW_GROUP
         if len(groups) == 1:
             return groups[0]
-        raise FormatError(
-            f"no trajectory is chosen; available trajectories: {known}.",
-            path=path,
-            hint="Choose one of them with --group." if groups else None,
-        )
+        hint = "Choose one of them with --group." if groups else None
+        raise FormatError(f"no trajectory is chosen; available trajectories: {known}.", hint=hint)
     if wanted not in groups:
-        raise FormatError(f'has no trajectory "{wanted}"; it has {known}.', path=path)
+        raise FormatError(f'has no trajectory "{wanted}"; it has {known}.')
     return wanted
 
 
-def _data(group: h5py.Group, key: str, name: str, path: Path) -> Array | None:
+def _data(group: h5py.Group, key: str, where: str) -> Array | None:
     if key not in group:
         return None
     link = group.get(key, getlink=True)
     held = group[key] if type(link).__name__ == "HardLink" else None
     if held is None or getattr(held, "external", None) or getattr(held, "is_virtual", False):
-        raise FormatError(f'group "{name}": "{key}" is stored outside the file.', path=path)
+        raise FormatError(f'{where}: "{key}" is stored outside the file.')
     if not hasattr(held, "shape") or held.dtype.kind not in "fiu" or not held.shape or held.size > _MOST_NUMBERS:
-        raise FormatError(f'group "{name}": "{key}" is not an array of at most {_MOST_NUMBERS} numbers.', path=path)
+        raise FormatError(f'{where}: "{key}" is not an array of at most {_MOST_NUMBERS} numbers.')
     return np.asarray(held[()], dtype=np.float64)
 
 
-def _poses(t: Array | None, rotations: Array | None, whole: Array | None, name: str, path: Path) -> Array:
+def _poses(t: Array | None, rotations: Array | None, whole: Array | None, where: str) -> Array:
     """Return the poses (F, 4, 4) from the data sets of a trajectory; translations are in the file's unit."""
     if whole is not None:
         if whole.ndim != 3 or whole.shape[1:] != (4, 4):
-            raise FormatError(f'group "{name}": "transformations" has shape {whole.shape}, not (N, 4, 4).', path=path)
+            raise FormatError(f'{where}: "transformations" has shape {whole.shape}, not (N, 4, 4).')
         return whole
     if rotations is None or t is None:
-        raise FormatError(f'group "{name}" has no "rotations".', path=path)
+        raise FormatError(f'{where} has no "rotations".')
     if t.ndim != 2 or t.shape[1] != 3:
-        raise FormatError(f'group "{name}": "translations" has shape {t.shape}; expected (N, 3).', path=path)
+        raise FormatError(f'{where}: "translations" has shape {t.shape}; expected (N, 3).')
     count = len(t)
     if rotations.shape == (count, 3, 3):
         return make_transform(rotations, t)
     if rotations.shape != (count, 4):
-        raise FormatError(
-            f'group "{name}": "rotations" has shape {rotations.shape}; expected ({count}, 4) or ({count}, 3, 3).',
-            path=path,
-        )
+        wanted = f"expected ({count}, 4) or ({count}, 3, 3)"
+        raise FormatError(f'{where}: "rotations" has shape {rotations.shape}; {wanted}.')
     norm = np.linalg.norm(rotations, axis=1)
     if (norm < 1e-6).any():
-        raise FormatError(f'group "{name}", row {int(norm.argmin()) + 1}: the quaternion is zero.', path=path)
+        raise FormatError(f"{where}, row {int(norm.argmin()) + 1}: the quaternion is zero.")
     return make_transform(matrix_from_wxyz(rotations), t)

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from jawusd.base.arrays import Array
-from jawusd.base.errors import FormatError, errors_name_file, explain_missing_packages
+from jawusd.base.errors import FormatError, errors_name_file, explain_missing_packages, naming_file
 from jawusd.base.inputs import check_input
 from jawusd.formats.markers import MarkerTable, RigidBody, length_unit, mark_hidden, read_body, read_markers
 from jawusd.geometry import rigid_fits, se3_inverse, transform_points
@@ -46,20 +46,20 @@ def marker_poses(
             marker.
     """
     path = Path(path)
-    unknown = sorted(set(rigid) - set(BODIES))
-    if unknown or "jaw" not in rigid:
-        named = ", ".join(rigid) or "none"
-        raise FormatError(f"rigid bodies given: {named}; jaw is required, head is optional.", path=path)
-    table = read_c3d(path) if path.suffix.lower() == ".c3d" else read_markers(path)
-    if table.unit not in (None, unit) and unit != "mm":
-        raise FormatError(f"is in {table.unit}, but --length-unit is {unit}.", path=path)
-    points = table.points * LENGTH_UNITS_MM[table.unit or unit]
-    moved = {name: _moved(name, body, points, table.names, rest_frame, unit, path) for name, body in rigid.items()}
+    with naming_file(path):
+        if set(rigid) - set(BODIES) or "jaw" not in rigid:
+            named = ", ".join(rigid) or "none"
+            raise FormatError(f"rigid bodies given: {named}; jaw is required, head is optional.")
+        table = read_c3d(path) if path.suffix.lower() == ".c3d" else read_markers(path)
+        if table.unit not in (None, unit) and unit != "mm":
+            raise FormatError(f"is in {table.unit}, but --length-unit is {unit}.")
+        points = table.points * LENGTH_UNITS_MM[table.unit or unit]
+        moved = {name: _moved(name, body, points, table.names, rest_frame, unit) for name, body in rigid.items()}
     return se3_inverse(moved["head"]) @ moved["jaw"] if "head" in moved else moved["jaw"], table.fps
 
 
 def in_head(
-    points: Array, names: tuple[str, ...], rigid: Mapping[str, str], rest_frame: int | None, unit: str, path: Path
+    points: Array, names: tuple[str, ...], rigid: Mapping[str, str], rest_frame: int | None, unit: str
 ) -> Array:
     """Return points (F, N, 3) [mm] relative to the rigid body "head", NaN where it is occluded; see `marker_poses`.
 
@@ -67,8 +67,8 @@ def in_head(
         FormatError: a rigid body other than the head is given, or the head does not fit the markers.
     """
     if set(rigid) != {"head"}:
-        raise FormatError(f'rigid bodies given: {", ".join(rigid)}; only "head" is allowed.', path=path)
-    T = _moved("head", rigid["head"], points, names, rest_frame, unit, path)
+        raise FormatError(f'rigid bodies given: {", ".join(rigid)}; only "head" is allowed.')
+    T = _moved("head", rigid["head"], points, names, rest_frame, unit)
     return transform_points(se3_inverse(T), points)
 
 
@@ -130,16 +130,14 @@ def _check_length(path: Path) -> None:
         raise FormatError(f"is truncated: {found} of {needed} bytes.", path=path, hint="Copy it again.")
 
 
-def _columns(body: RigidBody, names: tuple[str, ...], count: int, called: str, path: Path) -> list[int]:
+def _columns(body: RigidBody, names: tuple[str, ...], count: int, called: str) -> list[int]:
     """Return the columns of a rigid body's markers; names may omit the prefix "SUBJECT:" of the table's names."""
     own = [name.rpartition(":")[2] for name in names]
     found = []
     for marker in body.markers:
         number = own.index(str(marker)) + 1 if str(marker) in own else None
         if isinstance(marker, int) and body.points is None and number not in (None, marker):
-            raise FormatError(
-                f'"{marker}" is ambiguous: the name of marker {number} and the number of another marker.', path=path
-            )
+            raise FormatError(f'"{marker}" is ambiguous: the name of marker {number} and the number of another marker.')
         places = [marker - 1] if isinstance(marker, int) else [k for k, name in enumerate(names) if name == marker]
         if not places:
             places = [k for k, name in enumerate(own) if name == marker]
@@ -147,48 +145,42 @@ def _columns(body: RigidBody, names: tuple[str, ...], count: int, called: str, p
             listed = f": {', '.join(names)}" if names else ", without names" if isinstance(marker, str) else ""
             times = f" {len(places)} times" if len(places) > 1 else ""
             raise FormatError(
-                f"has {count} markers{listed}; the rigid body of the {called} uses marker {marker}{times}.", path=path
+                f"has {count} markers{listed}; the rigid body of the {called} uses marker {marker}{times}."
             )
         found.append(places[0])
     return found
 
 
 def _moved(
-    name: str, described: str, points: Array, names: tuple[str, ...], rest_frame: int | None, unit: str, path: Path
+    name: str, described: str, points: Array, names: tuple[str, ...], rest_frame: int | None, unit: str
 ) -> Array:
     """Return the poses (F, 4, 4) of a rigid body in the coordinate frame of the table."""
     body = read_body(described)
-    seen = points[:, _columns(body, names, points.shape[1], name, path)]
+    seen = points[:, _columns(body, names, points.shape[1], name)]
     given = None if body.points is None else body.points * LENGTH_UNITS_MM[unit]
-    shape = _shape_at(rest_frame, seen, body, name, path) if given is None else given
+    shape = _shape_at(rest_frame, seen, body, name) if given is None else given
     T, off_mm = rigid_fits(shape, seen)
     if not np.isfinite(off_mm).any():
-        raise FormatError(f"no frame shows three markers of the {name} that are not collinear.", path=path)
+        raise FormatError(f"no frame shows three markers of the {name} that are not collinear.")
     if np.nanmedian(off_mm) > _FARTHEST_MM:
         raise FormatError(
             f"its markers {', '.join(map(str, body.markers))} are {np.nanmedian(off_mm):.3g} mm from their positions "
             f"on the rigid body of the {name}; at most {_FARTHEST_MM:g} mm is allowed.",
-            path=path,
             hint="Check --rigid: the numbers of the markers, their order, and the units of table and rigid body.",
         )
     T[off_mm > _FARTHEST_MM] = np.nan
     return T
 
 
-def _shape_at(rest_frame: int | None, seen: Array, body: RigidBody, name: str, path: Path) -> Array:
+def _shape_at(rest_frame: int | None, seen: Array, body: RigidBody, name: str) -> Array:
     """Return the positions of the markers of a rigid body in the rest frame."""
     hint = "Give a frame (counted from 0) with the teeth in occlusion and all markers visible with --rest-frame."
     if rest_frame is None:
-        raise FormatError(
-            f"the positions of the markers on the rigid body of the {name} are unknown.", path=path, hint=hint
-        )
+        raise FormatError(f"the positions of the markers on the rigid body of the {name} are unknown.", hint=hint)
     if not 0 <= rest_frame < len(seen):
-        raise FormatError(f"has no frame {rest_frame}; it has frames 0 to {len(seen) - 1}.", path=path)
+        raise FormatError(f"has no frame {rest_frame}; it has frames 0 to {len(seen) - 1}.")
     hidden = [str(marker) for marker, point in zip(body.markers, seen[rest_frame]) if not np.isfinite(point).all()]
     if hidden:
-        raise FormatError(
-            f"frame {rest_frame} does not show all markers of the {name}; occluded: {', '.join(hidden)}.",
-            path=path,
-            hint=hint,
-        )
+        message = f"frame {rest_frame} does not show all markers of the {name}; occluded: {', '.join(hidden)}."
+        raise FormatError(message, hint=hint)
     return seen[rest_frame]

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from jawusd.base.arrays import Array, Mask
-from jawusd.base.errors import FormatError, errors_name_file
+from jawusd.base.errors import FormatError, errors_name_file, naming_file
 from jawusd.base.tables import read_table
 from jawusd.evaluator import JawRig
 from jawusd.evaluator.skin import Skin, load_skin
@@ -195,7 +195,8 @@ def read_face(
         return face
     points = face.X * LENGTH_UNITS_MM[face.unit or unit]
     if rigid:
-        points = in_head(points, face.names, rigid, rest_frame, unit, path)
+        with naming_file(path):
+            points = in_head(points, face.names, rigid, rest_frame, unit)
     return FaceTable(face.frames, points, face.names, face.fps, "mm")
 
 
