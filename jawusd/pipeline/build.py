@@ -137,15 +137,14 @@ def run_stages(run: Workspace, options: BuildOptions, tell: Callable[[Finding], 
     scans = None if all_labelled(capture) else _labelled(run)
     calibration = _calibrated(run) if capture.calibration is None and capture.boards is not None else None
 
-    settings: list[object] = [videos, capture.sync.model_dump(), names, capture.fps]
-    sync = run.run(SYNC, [], settings, lambda: ([], sync_cameras(capture, run.progress)))
+    sync = run.run(SYNC, [], [videos, capture.sync.model_dump(), names, capture.fps], lambda: _sync(run))
     offsets = sync.result["offsets"]
 
     described = capture.model_dump(mode="json", include={"frames", "bootstrap", "anatomy", "calibration_unit_mm"})
     labels = [camera.masks and camera.masks.labels for camera in capture.cameras]
     footage = [] if any(camera.masks for camera in capture.cameras) else videos
     solver = [options.solver, options.backend]
-    settings = [described, names, labels, rescaled_cameras(run.capture), offsets, solver, footage]
+    settings: list[object] = [described, names, labels, rescaled_cameras(run.capture), offsets, solver, footage]
     inputs = ["teeth", "mandible", "calibration", "masks"]
     track = run.run(TRACK, inputs, settings, lambda: _track(run, options, offsets))
 
@@ -205,6 +204,10 @@ def _check(run: Workspace) -> tuple[list[Path], CheckResult]:
     findings = check_capture(run.capture, run.folder, progress=run.progress)
     refuse_errors(findings, run.capture)
     return [], {"findings": [finding.as_json() for finding in findings]}
+
+
+def _sync(run: Workspace) -> tuple[list[Path], SyncNotes]:
+    return [], sync_cameras(run.capture, run.progress)
 
 
 def _track(run: Workspace, options: BuildOptions, offsets: dict[str, int]) -> tuple[list[Path], TrackSummary]:

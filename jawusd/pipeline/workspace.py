@@ -87,36 +87,6 @@ def input_hashes(
     return found
 
 
-class InputWatch:
-    """Hash inputs and detect later changes; files whose size and timestamps are unchanged are not read again."""
-
-    def __init__(self) -> None:
-        self._hashed: list[tuple[Capture, list[str], dict[str, str]]] = []
-        self._known: dict[tuple[object, ...], str] = {}
-
-    def hashes(self, capture: Capture, names: Iterable[str]) -> dict[str, str]:
-        """Return the hashes of `input_hashes` and store them for `changed`; raises CaptureError."""
-        names = list(names)
-        found = input_hashes(capture, names, self._hash)
-        self._hashed.append((capture, names, found))
-        return found
-
-    def changed(self) -> list[str]:
-        """Return the names, as in `input_files`, of the parts that changed since they were hashed."""
-        parts: set[str] = set()
-        for capture, names, before in self._hashed:
-            now = input_hashes(capture, names, self._hash)
-            parts |= {part for part in before.keys() | now.keys() if before.get(part) != now.get(part)}
-        return sorted(parts)
-
-    def _hash(self, files: list[Path]) -> str:
-        states = [(path, path.stat()) for path in files]
-        key = tuple((p, s.st_dev, s.st_ino, s.st_size, s.st_mtime_ns, s.st_ctime_ns) for p, s in states)
-        if key not in self._known:
-            self._known[key] = hash_files(files)
-        return self._known[key]
-
-
 def _sequence_files(path: Path) -> list[Path]:
     """Return the numbered files of an image pattern, or the path itself for a video."""
     if not is_pattern(path):
@@ -159,14 +129,34 @@ class Workspace:
         """Open a folder without locking it; `read_capture` is called again after each stage."""
         self._read_capture = read_capture
         self._opened = self.capture = capture
-        self._watch = InputWatch()
+        self._hashed: list[tuple[Capture, list[str], dict[str, str]]] = []
+        self._known: dict[tuple[object, ...], str] = {}  # hashes of files by their names, sizes and timestamps
         self.folder, self.progress = folder, progress
         self.state = BuildState(folder)
         self.reused: list[str] = []
 
     def hashes(self, parts: Iterable[str]) -> dict[str, str]:
-        """Return content hashes of parts of the capture (see `input_files`); raises CaptureError."""
-        return self._watch.hashes(self.capture, parts)
+        """Return content hashes of parts of the capture (see `input_hashes`), which are checked for later changes."""
+        names = list(parts)
+        found = input_hashes(self.capture, names, self._hash)
+        self._hashed.append((self.capture, names, found))
+        return found
+
+    def changed_inputs(self) -> list[str]:
+        """Return the names, as in `input_files`, of the parts that changed since they were hashed."""
+        parts: set[str] = set()
+        for capture, names, before in self._hashed:
+            now = input_hashes(capture, names, self._hash)
+            parts |= {part for part in before.keys() | now.keys() if before.get(part) != now.get(part)}
+        return sorted(parts)
+
+    def _hash(self, files: list[Path]) -> str:
+        """Return the hash of files; those whose size and timestamps are unchanged are not read again."""
+        states = [(path, path.stat()) for path in files]
+        key = tuple((p, s.st_dev, s.st_ino, s.st_size, s.st_mtime_ns, s.st_ctime_ns) for p, s in states)
+        if key not in self._known:
+            self._known[key] = hash_files(files)
+        return self._known[key]
 
     def run(
         self,
@@ -204,7 +194,7 @@ class Workspace:
 
     def _refuse_changes(self, stage: str) -> None:
         """Raise an error if inputs of a stage were edited while it ran: it is unknown which version was read."""
-        changed = self._watch.changed()
+        changed = self.changed_inputs()
         try:
             same = self._read_capture() == self._opened
         except JawusdError:  # an editor may be saving the file

@@ -10,7 +10,7 @@ from stage_results import stage_result
 from jawusd.base.errors import CaptureError
 from jawusd.pipeline import build, workspace
 from jawusd.pipeline.build import BuildOptions
-from jawusd.pipeline.workspace import InputWatch, input_files, open_capture
+from jawusd.pipeline.workspace import Workspace, input_files, open_capture
 
 EXAMPLE = ROOT / "examples" / "capture"
 FROM_TRACK = ["track", "fit", "refine", "bake", "report"]
@@ -196,13 +196,13 @@ def test_what_only_looks_like_a_change_stops_nothing(rebuilt, capture, change):
     assert rebuilt(during="track", change=change) == ["sync", *FROM_TRACK]
 
 
-def test_untouched_inputs_are_read_once(capture, monkeypatch):
+def test_untouched_inputs_are_read_once(capture, monkeypatch, tmp_path):
     read = []
     monkeypatch.setattr(workspace, "hash_files", lambda files: read.extend(files) or str(files))
-    watch, opened = InputWatch(), open_capture(capture)
+    run = Workspace(tmp_path / "out", open_capture(capture), lambda: open_capture(capture))
     for _ in range(3):
-        assert watch.hashes(opened, ["masks", "teeth"]) and watch.changed() == []
+        assert run.hashes(["masks", "teeth"]) and run.changed_inputs() == []
     assert len(read) == len(set(read)) == 8
     grow("masks/cam1/lower.mkv")(capture)
-    watch.changed()
+    run.changed_inputs()
     assert len(read) == 9
