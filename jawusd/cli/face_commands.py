@@ -149,7 +149,7 @@ def _learn(
     weights: bool = False,
 ) -> None:
     """Learn d from a face, or from its four jaw weights alone, and write and print the result."""
-    from jawusd.pipeline.skin import learn_jaw_weights, learn_skin, read_jaw
+    from jawusd.pipeline.skin import learn_skin, read_jaw
 
     loaded = jawusd.load(rig, prim=prim)
     jaw = read_jaw(loaded, take)
@@ -158,8 +158,7 @@ def _learn(
         jaw = jaw.with_bite(first, last)
     if face.fps is None:
         raise typer.BadParameter("is needed: the face capture does not state a frame rate.", param_hint="--fps")
-    learn = learn_jaw_weights if weights else learn_skin
-    skin, offset_s = learn(loaded, jaw, face, offset, head_error)
+    skin, offset_s = learn_skin(loaded, jaw, face, offset, head_error, jaw_weights=weights)
     jawusd.save_skin(out, skin)
     emit({"file": str(out), "offset_s": offset_s, **skin.meta}, as_json, _skin_lines(out, skin, offset_s))
 

@@ -219,18 +219,21 @@ def learn_skin(
     face: FaceTable,
     offset_s: float | None = None,
     head_error: tuple[float, float] = HEAD_ERROR,
+    *,
+    jaw_weights: bool = False,
 ) -> tuple[Skin, float]:
     """Learn to estimate d from facial motion; see `fitting.skin.fit_skin` and `fitting.skin.clock_offset`.
 
     Args:
         jaw, face: recordings of one performance, with frame rates.
         offset_s: seconds to add to times of `face` to obtain times of `jaw`; default: estimated.
+        jaw_weights: whether the face has only the four ARKit jaw weights, which are then checked to suffice.
 
     Returns:
         The map from face to d, and the offset [s].
 
     Raises:
-        FittingError: see `fitting.skin.clock_offset` and `fitting.skin.fit_skin`.
+        FittingError: see `fitting.skin.clock_offset`, `fitting.skin.fit_skin` and `fitting.face.check_jaw_weights`.
         ValueError: a frame rate is missing.
     """
     if not jaw.fps or not face.fps:
@@ -240,22 +243,6 @@ def learn_skin(
         offset_s = clock_offset(face_s, flat, times_s[jaw.seen], jaw.d[jaw.seen])
     X = columns_at(face_s + offset_s, flat, times_s).reshape(len(times_s), *face.X.shape[1:])
     skin = fit_skin(rig, X, jaw.d, jaw.seen, jaw.sigma_mm, head_error=head_error, names=face.names)
-    return skin, offset_s
-
-
-def learn_jaw_weights(
-    rig: JawRig,
-    jaw: JawTake,
-    face: FaceTable,
-    offset_s: float | None = None,
-    head_error: tuple[float, float] = (0.0, 0.0),
-) -> tuple[Skin, float]:
-    """Learn to estimate d from the four ARKit jaw weights; see `learn_skin` and `fitting.face.check_jaw_weights`.
-
-    Raises:
-        FittingError: see `fitting.face.check_jaw_weights`.
-    """
-    skin, offset_s = learn_skin(rig, jaw, face, offset_s, head_error)
-    face_s, times_s = face.frames / (face.fps or 1.0), jaw.frames[jaw.seen] / (jaw.fps or 1.0)
-    check_jaw_weights(rig, columns_at(face_s + offset_s, face.X, times_s), jaw.d[jaw.seen], skin.errors_mm["skin"])
+    if jaw_weights:
+        check_jaw_weights(rig, X[jaw.seen], jaw.d[jaw.seen], skin.errors_mm["skin"])
     return skin, offset_s
