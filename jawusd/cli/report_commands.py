@@ -189,10 +189,11 @@ def _name_changed_files(folder: Path) -> None:
 def _serve_capture(
     capture: Path, tracks: Path | None, host: str, port: int, browser: bool, allow_outside: bool
 ) -> None:
-    from jawusd.pipeline.view_capture import open_capture_viewer
+    from jawusd.pipeline.view_capture import viewed_capture
+    from jawusd.viewer.capture_page import CaptureViewer
 
     with progress() as report:
-        viewer = open_capture_viewer(capture, tracks, host, port, report, allow_outside=allow_outside)
+        viewer = CaptureViewer(viewed_capture(capture, tracks, report, allow_outside=allow_outside), host, port)
     try:
         _announce(browser, viewer.url)
         viewer.wait()

@@ -206,7 +206,7 @@ class _Follower:
         for source in self._sources.values():
             source.stop()
         if self._skin is not None:
-            self._skin.stop()
+            self._skin.face.stop()
 
     def run(self, seconds: float | None, silence_s: float) -> Iterator[LiveFrame]:
         """Yield one result per frame until the sources end."""
@@ -219,7 +219,7 @@ class _Follower:
         for source in self._sources.values():
             source.play(begin)
         if self._skin is not None:
-            self._skin.play(begin, silence_s)
+            self._skin.face.play(begin, silence_s)
         last, blind_since = begin + (start - 0.5) * self._period_s, 0.0
         while (at := self._next(last, silence_s)) is not None:
             if seconds is not None and at - begin > start * self._period_s + seconds:

@@ -81,6 +81,9 @@ class LiveSkin:
     The face data are a recording, in any format of `read_face`, if all cameras are files; its times begin with the
     images. Otherwise, they are a face table (see `formats.face_table`) that is read while it is written: a growing
     file, a pipe or the standard input. Its clock is aligned by the arrival times of the rows.
+
+    Attributes:
+        face: the face data, to be played and stopped like the sources of images.
     """
 
     def __init__(self, rig: JawRig, options: SkinOptions, *, recorded: bool) -> None:
@@ -92,19 +95,7 @@ class LiveSkin:
         self._skin, self._options = load_own_skin(rig, options.skin), options
         self._filter, self._agreed = SkinFilter(), deque[tuple[SkinJaw, Array]](maxlen=_COMPARED)
         whole = recorded and Path(options.face).is_file()
-        self._face: RecordedFace | FaceStream = (RecordedFace if whole else FaceStream)(self._skin, options)
-
-    def play(self, begin_s: float, silence_s: float) -> None:
-        """Start a recording at `begin_s` on the live clock, or wait for the first row of a stream.
-
-        Raises:
-            FormatError: a stream has no row within `silence_s` [s], or an invalid one.
-        """
-        self._face.play(begin_s, silence_s)
-
-    def stop(self) -> None:
-        """Stop reading the face data."""
-        self._face.stop()
+        self.face: RecordedFace | FaceStream = (RecordedFace if whole else FaceStream)(self._skin, options)
 
     def fuse(self, at_s: float, jaw: LiveJaw, seconds: float) -> LiveJaw:
         """Return the jaw of a frame, corrected with skin; the state is `SKIN` if an arch is hidden and skin was used.
@@ -117,7 +108,7 @@ class LiveSkin:
         Raises:
             FormatError, FittingError: a row of the face data is invalid, or skin and visible teeth disagree.
         """
-        columns = self._face.at(at_s)
+        columns = self.face.at(at_s)
         found, seen = self._skin(columns), jaw.state == SolveState.SOLVED
         if seen and found.familiar:
             self._agreed.append((found, jaw.d))

@@ -33,7 +33,6 @@ from jawusd.pipeline.workspace import open_capture
 if TYPE_CHECKING:
     from jawusd.media.overlay import Backdrop, PlacedScan
     from jawusd.media.side_by_side import CameraWall
-    from jawusd.viewer.capture_page import CaptureViewer
     from jawusd.viewer.viewed import Look, ViewedCapture, ViewedFootage
 
 
@@ -41,26 +40,6 @@ _TRACKS = "tracks.npz"
 _SPECKS_PERCENT = 0.5
 _TILE_PX = (480, 360)  # maximum size of a camera's tile; three tiles fill the width of the page
 _FILL: dict[Look, float] = {"outlines": 0.0, "tinted": 0.3}
-
-
-@explain_missing_packages()
-def open_capture_viewer(
-    path: str | os.PathLike[str],
-    tracks: Path | None,
-    host: str,
-    port: int,
-    progress: Progress,
-    *,
-    allow_outside: bool = False,
-) -> CaptureViewer:
-    """Serve a capture to browsers; parameters and errors as for `viewed_capture`.
-
-    Raises:
-        MissingDependencyError: the viewer is not installed.
-    """
-    from jawusd.viewer.capture_page import CaptureViewer
-
-    return CaptureViewer(viewed_capture(path, tracks, progress, allow_outside=allow_outside), host, port)
 
 
 def viewed_capture(

@@ -48,7 +48,7 @@ def options(learned, tmp_path):
 def followed(rig, options, hidden, begin=100.0):
     """Return d (F, 3), states and familiar of 36 s whose teeth are hidden in some frames."""
     skin, held, told = LiveSkin(rig, options, recorded=True), np.zeros(3), []
-    skin.play(begin, 1.0)
+    skin.face.play(begin, 1.0)
     times = np.arange(1, 36 * FPS) / FPS
     for t, true in zip(times, motion(times), strict=True):
         seen = not hidden(t)
@@ -58,7 +58,7 @@ def followed(rig, options, hidden, begin=100.0):
         jaw = skin.fuse(begin + t, LiveJaw(held, size**2 * np.eye(3), state), 1 / FPS)
         held = jaw.d
         told.append(jaw)
-    skin.stop()
+    skin.face.stop()
     return times, told
 
 
@@ -125,8 +125,8 @@ def test_maps_and_faces_of_others_are_refused(learned, options, tmp_path):
         LiveSkin(rig, replace(options, face=other), recorded=True)
     stream = LiveSkin(rig, replace(options, face=other), recorded=False)
     with pytest.raises(FormatError, match="2 columns;.* learned from 12 coordinates"):
-        stream.play(0.0, 5.0)
-    stream.stop()
+        stream.face.play(0.0, 5.0)
+    stream.face.stop()
     other.write_text(HEADER.replace("time_s", "frame") + "\n" + lines([0.0], np.zeros((1, 4, 3)))[0])
     with pytest.raises(FormatError, match="--face-fps"):
         LiveSkin(rig, replace(options, face=other), recorded=True)
@@ -161,7 +161,7 @@ def test_a_face_is_followed_while_it_is_written(learned, options, tmp_path, pipe
     face = LiveSkin(rig, SkinOptions(skin, path), recorded=False)
     writer = threading.Thread(target=write)
     writer.start()
-    face.play(began, 10.0)
+    face.face.play(began, 10.0)
     unknown = LiveJaw(np.zeros(3), 100 * np.eye(3), SolveState.CARRIED)
     told = []
     while (at := live_source.now_s()) < began + 0.45:
@@ -173,7 +173,7 @@ def test_a_face_is_followed_while_it_is_written(learned, options, tmp_path, pipe
     time.sleep(max(0.0, began + 0.9 - live_source.now_s()))
     silent = face.fuse(live_source.now_s(), unknown, 1 / FPS)
     assert silent.state == SolveState.CARRIED and silent.familiar is None
-    face.stop()
+    face.face.stop()
     writer.join()
 
 
@@ -183,15 +183,15 @@ def test_a_face_that_never_comes_or_goes_back_is_refused(learned, tmp_path):
     path.write_text(HEADER + "\n")
     silent = LiveSkin(rig, SkinOptions(skin, path), recorded=False)
     with pytest.raises(FormatError, match="no row of face data after 0.2 s.*without buffering"):
-        silent.play(0.0, 0.2)
-    silent.stop()
+        silent.face.play(0.0, 0.2)
+    silent.face.stop()
     path.write_text("".join([HEADER + "\n", *lines([1.0, 0.5], np.zeros((2, 4, 3)))]))
     back = LiveSkin(rig, SkinOptions(skin, path), recorded=False)
     with pytest.raises(FormatError, match="line 3 is not later than the row before"):
-        back.play(0.0, 5.0)
+        back.face.play(0.0, 5.0)
         for _ in range(50):
             back.fuse(live_source.now_s(), LiveJaw(np.zeros(3), np.eye(3), SolveState.CARRIED), 0.04)
-    back.stop()
+    back.face.stop()
 
 
 def test_columns_are_interpolated_over_short_gaps_only():

@@ -16,7 +16,8 @@ from short_example import shortened
 from jawusd.formats.capture import load_capture
 from jawusd.formats.tracks import load_tracks
 from jawusd.geometry import transform_point, transform_points
-from jawusd.pipeline.view_capture import open_capture_viewer
+from jawusd.pipeline.view_capture import viewed_capture
+from jawusd.viewer.capture_page import CaptureViewer
 from jawusd.viewer.plots import ACROSS
 
 EXAMPLE = ROOT / "examples" / "capture"
@@ -47,7 +48,7 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def viewer(folder):
-    running = open_capture_viewer(folder, None, "127.0.0.1", 0, quiet)
+    running = CaptureViewer(viewed_capture(folder, None, quiet), "127.0.0.1", 0)
     yield running
     running.stop()
 
@@ -229,7 +230,7 @@ def test_picks_made_in_the_page_build_a_rig(tab, folder, tmp_path):
 
 @pytest.mark.slow
 def test_tracked_poses_are_drawn_and_the_plot_is_a_timeline(chromium, example_build):
-    viewer = open_capture_viewer(EXAMPLE, example_build[0], "127.0.0.1", 0, quiet)
+    viewer = CaptureViewer(viewed_capture(EXAMPLE, example_build[0], quiet), "127.0.0.1", 0)
     tab = CaptureTab(chromium, viewer)
     tab.settle()
     footage = tab.page.footage
