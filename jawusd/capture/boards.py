@@ -86,7 +86,8 @@ def find_boards(names: tuple[str, ...], boards: Boards, progress: Callable[[int,
     widths = np.array([[width for _, width in camera] for camera in found])
     seen = np.isfinite(widths)
     for name, clip, mask in zip(names, clips, seen):
-        _check_board(name, clip, chosen, boards, int(mask.sum()))
+        if (fault := _board_fault(clip, chosen, boards, int(mask.sum()))) is not None:
+            raise CalibrationError(fault[0], camera=name, path=clip.path, hint=fault[1])
     limits = _limits_px(widths)
     blurred = seen & (widths > limits[:, None])
     for c in np.flatnonzero(seen.any(1) & (blurred == seen).all(1)):
@@ -143,33 +144,22 @@ def _limits_px(widths: Array) -> Array:
     return np.clip(_BLUR_RATIO * median, *_BLUR_LIMITS_PX)
 
 
-def _check_board(name: str, clip: BoardClip, chosen: list[int], boards: Boards, found: int) -> None:
-    """Raise an error if the images show no board, or a board different from [boards]."""
+def _board_fault(clip: BoardClip, chosen: list[int], boards: Boards, found: int) -> tuple[str, str] | None:
+    """Return what is wrong if images show no board, or a board different from [boards], and what to do."""
     missed = found < len(chosen) / 2
     if missed and clip.is_interlaced:
-        raise CalibrationError(
-            f"the board was found in {found} of {len(chosen)} images: {INTERLACED}.",
-            camera=name,
-            path=clip.path,
-            hint=INTERLACED_HINT,
-        )
+        return f"the board was found in {found} of {len(chosen)} images: {INTERLACED}.", INTERLACED_HINT
     if not missed and boards.pattern == "chessboard":
-        return  # only a ChArUco board can be detected as part of a different board
+        return None  # only a ChArUco board can be detected as part of a different board
     some = [image for _, image in clip.pictures(chosen[:: max(1, len(chosen) // _LOOKED_AT)])]
     if (other := different_board(some, boards, missed)) is not None:
-        raise CalibrationError(
-            f"{other}.",
-            camera=name,
-            path=clip.path,
-            hint="Correct [boards] in capture.toml; cols and rows count inner corners, one less than squares.",
-        )
-    if not found:
-        extra = f" of {boards.dictionary}" if boards.pattern == "charuco" else ""
-        raise CalibrationError(
-            f"no {boards.pattern}{extra} with {boards.cols} x {boards.rows} inner corners was found in any of "
-            f"{len(chosen)} images.",
-            camera=name,
-            path=clip.path,
-            hint="Check pattern and inner corners in [boards]; a chessboard must be fully in view, sharp, and have a "
-            "white rim.",
-        )
+        hint = "Correct [boards] in capture.toml; cols and rows count inner corners, one less than squares."
+        return f"{other}.", hint
+    if found:
+        return None
+    extra = f" of {boards.dictionary}" if boards.pattern == "charuco" else ""
+    board = f"{boards.pattern}{extra} with {boards.cols} x {boards.rows} inner corners"
+    return (
+        f"no {board} was found in any of {len(chosen)} images.",
+        "Check pattern and inner corners in [boards]; a chessboard must be fully in view, sharp, and have a white rim.",
+    )

@@ -271,8 +271,10 @@ def board_shape_error(cameras: list[Camera], bundle: Bundle, points_mm: Array, c
         near = np.linalg.norm(found - centre_mm, axis=1) < _MOUTH_RADIUS_MM
         errors.append(distance_errors(found[near], points_mm[enough][near]))
     every = np.concatenate([np.empty(0), *errors])
-    found = (every.mean(), np.percentile(every, 95), every.max()) if len(every) else (np.nan,) * 3
-    return {**dict(zip(("mean", "p95", "max"), map(float, found), strict=True)), "distances": len(every)}
+    if not len(every):
+        return {"mean": float("nan"), "p95": float("nan"), "max": float("nan"), "distances": 0}
+    p95 = float(np.percentile(every, 95))
+    return {"mean": float(every.mean()), "p95": p95, "max": float(every.max()), "distances": len(every)}
 
 
 def expected_shape_error(cameras: list[Camera], bundle: Bundle, centre_mm: Array) -> float:

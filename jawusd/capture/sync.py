@@ -241,36 +241,31 @@ def _notes(clips: Mapping[str, Clip]) -> Iterator[str]:
             )
 
 
-def _frames_of_number(clip: Clip) -> int:
-    """Return the number of images that have the same time code; raise CaptureError if it is not an integer."""
+def _timecodes(clips: Mapping[str, Clip]) -> dict[str, int]:
+    out = {}
+    for name, clip in clips.items():
+        try:
+            out[name] = _timecode_frame(clip)
+        except CaptureError as error:
+            raise SyncError(error.message, camera=name, path=clip.path, hint=error.hint) from error
+    return out
+
+
+def _timecode_frame(clip: Clip) -> int:
+    """Return the frame number that the time code of a clip's first image states; raise CaptureError if it cannot."""
+    if not clip.timecode:
+        hint = 'Set timecode = "HH:MM:SS:FF" of the first frame in this [[camera]], or synchronise by light flashes.'
+        raise CaptureError("the clip has no time code.", hint=hint)
     ratio = clip.timeline.rate / (clip.timecode_fps or clip.timeline.rate)
-    if round(ratio) < 1 or abs(ratio / round(ratio) - 1) > _NEARLY_WHOLE:
+    shared = round(ratio)  # number of images that have the same time code
+    if shared < 1 or abs(ratio / shared - 1) > _NEARLY_WHOLE:
         raise CaptureError(
             f"the time code has {clip.timecode_fps:.6g} frames per second, which is not an integer fraction of the "
             f"clip's {clip.timeline.rate:.6g} frames per second.",
             hint="State the time code of the first frame at the frame rate of the clip, or synchronise "
             "by light flashes.",
         )
-    return round(ratio)
-
-
-def _timecodes(clips: Mapping[str, Clip]) -> dict[str, int]:
-    out = {}
-    for name, clip in clips.items():
-        if not clip.timecode:
-            raise SyncError(
-                "the clip has no time code.",
-                camera=name,
-                path=clip.path,
-                hint='Set timecode = "HH:MM:SS:FF" of the first frame in this [[camera]], or '
-                "synchronise by light flashes.",
-            )
-        try:
-            shared = _frames_of_number(clip)
-            out[name] = shared * frame_of_timecode(clip.timecode, clip.timeline.rate / shared)
-        except CaptureError as error:
-            raise SyncError(error.message, camera=name, path=clip.path, hint=error.hint) from error
-    return out
+    return shared * frame_of_timecode(clip.timecode, clip.timeline.rate / shared)
 
 
 def _numbers(capture: Capture, clips: Mapping[str, Clip]) -> dict[str, int]:

@@ -157,16 +157,9 @@ def _lines(path: Path) -> list[str]:
 
 
 def _line(frame: int, entry: FrameEntry) -> str:
-    data = json.loads(json.dumps({"frame": frame, "entry": _without_nan(entry)}))
+    # JSON has no NaN and infinity; they become null.
+    data = json.loads(json.dumps({"frame": frame, "entry": entry}), parse_constant=lambda _: None)
     return json.dumps({**data, "sha256": hash_value(data)})
-
-
-def _without_nan(value: object) -> object:
-    if isinstance(value, dict):
-        return {key: _without_nan(item) for key, item in value.items()}
-    if isinstance(value, list):
-        return [_without_nan(item) for item in value]
-    return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
 def _entry(line: str) -> tuple[int, FrameEntry] | None:

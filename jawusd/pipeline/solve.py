@@ -268,14 +268,10 @@ def solve_summary(performance: Performance) -> SolveSummary:
         limits=solve_limits(p.camera_names),
         findings=cast("list[dict[str, str | float | int]]", p.notes.get("findings", [])),
     )
-    if "focal" in p.notes:
-        summary["focal"] = cast("dict[str, tuple[float, float]]", p.notes["focal"])
-    if "skin_learned" in p.notes:
-        summary["skin_learned"] = cast(SkinLearned, p.notes["skin_learned"])
-    if "skin_offset_s" in p.notes:
-        summary["skin_offset_s"] = cast(float, p.notes["skin_offset_s"])
-        summary["unfamiliar"] = _runs(np.intersect1d(by_skin, cast("list[int]", p.notes["unfamiliar"])))
-    return summary
+    known = {name: p.notes[name] for name in ("focal", "skin_learned", "skin_offset_s") if name in p.notes}
+    if "unfamiliar" in p.notes:
+        known["unfamiliar"] = _runs(np.intersect1d(by_skin, cast("list[int]", p.notes["unfamiliar"])))
+    return cast(SolveSummary, {**summary, **known})  # the values of notes are untyped JSON
 
 
 def _runs(frames: NDArray[np.int64]) -> list[tuple[int, int]]:
