@@ -6,7 +6,7 @@ import os
 import re
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePath
 
 from jawusd.formats.capture_writing import CameraSketch
@@ -171,12 +171,17 @@ def camera_names(paths: Sequence[PurePath]) -> dict[PurePath, str]:
     return out
 
 
+def fitting(name: str, paths: Iterable[PurePath]) -> list[PurePath]:
+    """Return the paths that contain all words of a name."""
+    telling = set(words(PurePath(name)))
+    return [path for path in paths if telling <= set(words(path))]
+
+
 def pair(names: Mapping[PurePath, str], others: Sequence[PurePath]) -> tuple[dict[PurePath, PurePath], bool]:
     """Match files of one camera each to clips with camera names; also return whether names, not the order, match."""
     found: dict[PurePath, PurePath] = {}
     for clip, name in names.items():
-        telling = set(words(PurePath(name)))
-        fits = [other for other in others if telling <= set(words(other))]
+        fits = fitting(name, others)
         if len(fits) == 1 and fits[0] not in found.values():
             found[clip] = fits[0]
     if names and not found and len(others) == len(names):
@@ -188,11 +193,7 @@ def with_masks(cameras: Sequence[CameraSketch], masks: Mapping[PurePath, str]) -
     """Return each camera with the masks whose paths contain the words of its name."""
     out = []
     for camera in cameras:
-        telling = set(words(PurePath(camera.name)))
-        rows = {
-            row: [path for path, own in masks.items() if own == row and telling <= set(words(path))]
-            for row in ("upper", "lower")
-        }
-        own = {row: paths[0] for row, paths in rows.items() if len(paths) == 1}
-        out.append(CameraSketch(camera.name, camera.video, own, camera.board, camera.remark))
+        own = fitting(camera.name, masks)
+        rows = {row: [path for path in own if masks[path] == row] for row in ("upper", "lower")}
+        out.append(replace(camera, masks={row: paths[0] for row, paths in rows.items() if len(paths) == 1}))
     return out

@@ -15,7 +15,7 @@ from jawusd.base.errors import CaptureError, JawusdError, explain_missing_packag
 from jawusd.formats.atomic import write_text_atomic
 from jawusd.formats.capture_writing import BoardSketch, CameraSketch, CaptureSketch, capture_text
 from jawusd.pipeline.cameras import SameSize, read_calibration
-from jawusd.pipeline.folder_files import FoundFiles, camera_names, find_files, pair, with_masks, words
+from jawusd.pipeline.folder_files import FoundFiles, camera_names, find_files, fitting, pair, with_masks
 from jawusd.pipeline.state import Progress
 
 if TYPE_CHECKING:
@@ -174,8 +174,7 @@ def _named_as_calibrated(
     """Return the calibration's camera name of each clip, matched by the words of the clips' paths."""
     fits: dict[PurePath, str] = {}
     for clip in names:
-        own = set(words(clip))
-        found = [name for name in calibrated if set(words(PurePath(name))) <= own]
+        found = [name for name in calibrated if fitting(name, [clip])]
         if len(found) == 1 and found[0] not in fits.values():
             fits[clip] = found[0]
     if len(fits) == len(names):
