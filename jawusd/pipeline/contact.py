@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from typing_extensions import TypedDict
@@ -133,7 +133,9 @@ def with_condyle_contact(model: JawModel, joints: Surfaces | str, progress: Prog
     return model
 
 
-def _measured(model: JawModel, name: str, solids: Surfaces | str, parts: str, *sampling: float) -> JawModel:
+def _measured(
+    model: JawModel, name: str, solids: Surfaces | str, parts: Literal["teeth", "condyles"], *sampling: float
+) -> JawModel:
     """Return the model with the clearances of some parts, or with the reason why they could not be measured."""
     from jawusd.meshes.contact import sample_field
 

@@ -262,7 +262,8 @@ def _learned(path: Path) -> LearnedNumbers | None:
     try:
         learned = json.loads(read_text(path, _MAX_LEARNED_BYTES))
         first, last = (float(value) for value in learned["disagreement"])
-        return {**learned, "pictures": int(learned["pictures"]), "disagreement": [first, last]}
+        numbers, pictures = dict(learned["numbers"]), int(learned["pictures"])
+        return {"numbers": numbers, "disagreement": [first, last], "pictures": pictures}
     except (ValueError, TypeError, KeyError, OverflowError, RecursionError) as error:
         hint = "Run `jawusd segment` again without --resume."
         raise FormatError(f"is not what `jawusd segment` wrote ({error}).", path=path, hint=hint) from error

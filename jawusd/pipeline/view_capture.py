@@ -67,7 +67,7 @@ def viewed_capture(
         capture = as_built(capture, build)
     poses = _poses(capture, tracks)
     cameras = [] if capture.calibration is None else load_cameras(capture)
-    meshes = load_meshes(capture, poses and poses.meta)
+    meshes = load_meshes(capture, None if poses is None else poses.meta)
     if poses is not None:
         cameras = tracked_cameras(cameras, poses)
     offsets = _offsets(capture, build, progress)
