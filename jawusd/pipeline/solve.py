@@ -268,7 +268,8 @@ def solve_summary(performance: Performance) -> SolveSummary:
         limits=solve_limits(p.camera_names),
         findings=cast("list[dict[str, str | float | int]]", p.notes.get("findings", [])),
     )
-    known = {name: p.notes[name] for name in ("focal", "skin_learned", "skin_offset_s") if name in p.notes}
+    optional = ("focal", "skin_learned", "skin_offset_s")
+    known: dict[str, object] = {name: p.notes[name] for name in optional if name in p.notes}
     if "unfamiliar" in p.notes:
         known["unfamiliar"] = _runs(np.intersect1d(by_skin, cast("list[int]", p.notes["unfamiliar"])))
     return cast(SolveSummary, {**summary, **known})  # the values of notes are untyped JSON
