@@ -62,6 +62,10 @@ class Example:
     scene: Scene
     drawn: NDArray[np.float32]  # annotated coverage of both arches, shape (2, h, w)
 
+    def cut(self, config: SegmentationConfig) -> NDArray[np.float32]:
+        """Segment without the annotated masks; return the coverage of both arches, shape (2, h, w)."""
+        return self.scene.cut(config, config.reach_mm[-1])[0]
+
 
 @dataclass(frozen=True, eq=False)
 class Segment:
@@ -250,12 +254,12 @@ class LearnedNumbers(TypedDict):
 
 def learn_numbers(examples: Sequence[Example], config: SegmentationConfig) -> tuple[SegmentationConfig, LearnedNumbers]:
     """Optimise the weights one by one for agreement with annotated masks; return them and a summary of the changes."""
-    best, cuts = config, _cuts(examples, config)
+    best, cuts = config, [example.cut(config) for example in examples]
     before = least = _disagreement(examples, cuts)
     for trial in _trials(config):
         changed = {name: value for name, value in vars(trial).items() if value != getattr(config, name)}
         trial = replace(best, **changed)
-        found = _cuts(examples, trial)
+        found = [example.cut(trial) for example in examples]
         value = _disagreement(examples, found)
         if value < (1 - _LEAST_GAIN) * least:
             best, cuts, least = trial, found, value
@@ -267,11 +271,6 @@ def learn_numbers(examples: Sequence[Example], config: SegmentationConfig) -> tu
         best, least = replace(best, wider=wider), value
     changed = {name: value for name, value in vars(best).items() if value != getattr(config, name)}
     return best, {"numbers": changed, "disagreement": [before, least], "pictures": len(examples)}
-
-
-def _cuts(examples: Sequence[Example], config: SegmentationConfig) -> list[NDArray[np.float32]]:
-    """Return the coverages of both arches in examples that are segmented without their masks, shape (2, h, w) each."""
-    return [example.scene.cut(config, config.reach_mm[-1])[0] for example in examples]
 
 
 def _trials(config: SegmentationConfig) -> Iterator[SegmentationConfig]:
