@@ -116,7 +116,7 @@ class ModelMeta(TypedDict, total=False):
 class SyncNotes(TypedDict, total=False):
     """Offset of every camera from the reference camera [frames], with quality figures of the method that found it."""
 
-    method: Required[str]
+    method: str
     offsets: Required[dict[str, Frames]]
     reference: str
     exact_frames: dict[str, float]
