@@ -17,6 +17,7 @@ from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.contour.solver import ContourSolver
 from jawusd.tracking.contour.views import masked_sources
 from jawusd.tracking.initialization.footage import Footage
+from jawusd.tracking.initialization.pose_search import Candidate
 from jawusd.tracking.performance import single_start
 from jawusd.tracking.performance.coordinates import Coordinates, Pose
 from jawusd.tracking.performance.single_start import SingleStart
@@ -63,6 +64,37 @@ def test_other_jaw_parameters_leave_an_arch_in_place(jaw, scans, truth, arch):
     moved = coordinates.with_jaw(pose, pose.d + [6.0, 1, 0], arch)
     np.testing.assert_allclose(coordinates.arches(moved)[arch], coordinates.arches(pose)[arch], atol=1e-9)
     assert moved.d == pytest.approx(pose.d + [6.0, 1, 0])
+
+
+@pytest.mark.parametrize(("kept", "arch"), [(1.0, 0), (0.2, 1)])
+def test_poses_of_the_lower_teeth_are_searched_if_lips_hide_most_upper_ones(
+    jaw, scans, truth, folder, tmp_path, monkeypatch, kept, arch
+):
+    camera, hidden, searched = small_take.CAMERAS[0], shutil.copytree(folder, tmp_path / "hidden"), []
+    for path in (hidden / camera.name / "upper").glob("*.png"):
+        mask = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+        rows = np.flatnonzero(mask.any(1))
+        mask[: int(rows[-1] - kept * np.ptp(rows))] = 0
+        cv2.imwrite(str(path), mask)
+    search, footage = prepared(jaw, scans, truth, hidden, camera)
+    monkeypatch.setattr(single_start, "search_arch", lambda scan, which, *rest: searched.append(which) or [])
+    assert search.at(footage, small_take.FIRST) is None and set(searched) == {arch}
+
+
+@pytest.mark.parametrize("arch", [0, 1])
+def test_jaw_poses_are_tried_around_the_pose_of_either_arch(jaw, scans, truth, folder, arch):
+    camera, coordinates, k = small_take.CAMERAS[0], Coordinates(jaw, scans), int(truth[0][:, 0].argmax())
+    search, footage = prepared(jaw, scans, truth, folder, camera)
+    true = coordinates.arches(Pose(truth[1][k], truth[0][k]))
+    with footage.views(transform_point(true[0], scans[0].centre), 2.0) as masks:
+        views = masks.at(small_take.FIRST + k)
+    pairs = search._with_jaws(views, arch, Candidate(100.0, true[arch]))
+    for _, pose in pairs:
+        np.testing.assert_allclose(coordinates.arches(pose)[arch], true[arch], atol=1e-6)
+    off = transform_point(coordinates.arches(pairs[0][1])[1 - arch], scans[0].centre) - transform_point(
+        true[1 - arch], scans[0].centre
+    )
+    assert np.linalg.norm(off) < 4.0
 
 
 @pytest.mark.slow

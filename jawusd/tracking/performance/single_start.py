@@ -17,7 +17,7 @@ from jawusd.base.arrays import Array
 from jawusd.base.errors import TrackingError
 from jawusd.evaluator import JawRig
 from jawusd.formats.mesh import Mesh
-from jawusd.geometry import make_transform, transform_point, transform_points
+from jawusd.geometry import make_transform, se3_inverse, transform_point, transform_points
 from jawusd.meshes.raster import count_bits
 from jawusd.tracking.config import Mapper
 from jawusd.tracking.contour.quality import arch_fit
@@ -59,11 +59,14 @@ _GRID = Grid(
     reach_mm=(18.0, 7.5, 0.1),
 )
 _SHIFTS = np.stack(np.meshgrid(*[np.arange(-3, 3.1, 1.5)] * 2, [0.0], indexing="ij"), axis=-1).reshape(-1, 3)
+# Ratio of the areas of the lower and the upper mask above which poses of the lower teeth are searched, not of the upper
+# ones: a strip of teeth below the lip does not determine the tilt of the head.
+_MOSTLY_HIDDEN = 2.0
 #: Number of jaw poses, over the whole range, that searches try.
 JAWS = 32
-# Numbers per candidate width of head poses kept, each with all jaw poses, and of pairs of head and jaw poses aligned in
-# a few steps; numbers of pairs aligned fully, and at the working resolution. Each distance has its share, since masks
-# rank distances poorly before poses are aligned: near teeth cover more of them.
+# Numbers per candidate width of poses of an arch kept, each with all jaw poses, and of pairs of head and jaw poses
+# aligned in a few steps; numbers of pairs aligned fully, and at the working resolution. Each distance has its share,
+# since masks rank distances poorly before poses are aligned: near teeth cover more of them.
 _HEADS, _TRIED, _FINALISTS, _WINNERS = 17, 12, 24, 5
 # Penalty per crown pixel outside the mask, in px of contour [1/px]: low, since lips may hide crowns.
 _OUTSIDE_PRICE = 0.05
@@ -91,7 +94,7 @@ class SingleStart:
         solver = solver.exact()
         self._jaw, self._map, self._config = jaw, map_, solver.config
         self._coarse = tuple(coarse_scan(mesh, name) for mesh, name in zip(meshes, ARCH_NAMES, strict=True))
-        self._hinge = hinge_at_front(self._coarse[0].crown_vertices(), T_anatomical_scan)
+        self._hinges = [hinge_at_front(scan.crown_vertices(), T_anatomical_scan) for scan in self._coarse]
         weight = np.full(2, 1.0 / solver.config.typical_noise_px3)
         # Residual gates scale with the resolution. Otherwise, they would be so wide in mm that teeth half hidden by
         # lips would be fitted to their visible part, as if the teeth were smaller.
@@ -151,31 +154,38 @@ class SingleStart:
         return best
 
     def _searched(self, views: Sequence[View], places: Array) -> list[Pose]:
-        """Return the most promising head poses, ranked with both arches, each with its most promising jaw pose."""
+        """Return the most promising poses of head and jaw: poses of one arch, each with the jaw poses that fit best."""
         instant, few = self._rough.instant(views), self._rough.config.trial_gates_px
+        upper_px, lower_px = ((mask > 127).sum() for mask in views[0].masks)
+        arch = int(lower_px > _MOSTLY_HIDDEN * upper_px)
         tried: list[tuple[float, Pose]] = []
         for pair in places:
-            base = make_transform(guessed_axes(pair, views[0].eye[None]), pair[0])
-            found = search_arch(self._coarse[0], 0, views, _PX_PER_MM, base, self._hinge, _GRID, self._map)
+            base = make_transform(guessed_axes(pair, views[0].eye[None]), pair[arch])
+            scan, hinge = self._coarse[arch], self._hinges[arch]
+            found = search_arch(scan, arch, views, _PX_PER_MM, base, hinge, _GRID, self._map)
             found = [
-                replace(head, objective=head.objective - self._outside_price(0, head.pose, views[0])) for head in found
+                replace(one, objective=one.objective - self._outside_price(arch, one.pose, views[0])) for one in found
             ]
-            found = sorted(found, key=lambda head: -head.objective)
-            heads = distinct(found, self._coarse[0].probes[::20], _DISTINCT_MM, _HEADS)
+            found = sorted(found, key=lambda one: -one.objective)
+            kept = distinct(found, scan.probes[::20], _DISTINCT_MM, _HEADS)
             pairs = sorted(
-                (pair for some in self._map(partial(self._with_jaws, views), heads) for pair in some), key=_descending
+                (pair for some in self._map(partial(self._with_jaws, views, arch), kept) for pair in some),
+                key=_descending,
             )
             tried += [(self._after(pose, instant, few)[0], pose) for _, pose in pairs[:_TRIED]]
         return [pose for _, pose in sorted(tried, key=_descending)[:_FINALISTS]]
 
-    def _with_jaws(self, views: Sequence[View], head: Candidate) -> list[tuple[float, Pose]]:
-        """Return the two most promising jaw poses for a head pose, with the objectives of both arches together."""
-        place = transform_point(head.pose, self._coarse[1].centre)
-        correlation = ShiftCorrelation(views[0], 1, _PX_PER_MM, _SHIFTS @ head.pose[:3, :3].T, place)
-        poses = head.pose @ self._jaw.pose(self._jaws)
-        prices = np.array([self._outside_price(1, pose, views[0]) for pose in poses])
-        scores = correlation.objectives(self._coarse[1], poses).max(axis=1) - prices
-        return [(head.objective + scores[k], Pose(head.pose, self._jaws[k])) for k in np.argsort(scores)[::-1][:2]]
+    def _with_jaws(self, views: Sequence[View], arch: int, found: Candidate) -> list[tuple[float, Pose]]:
+        """Return the two most promising jaw poses for the pose of an arch, with the objectives of both arches."""
+        other, motions = 1 - arch, self._jaw.pose(self._jaws)
+        poses = found.pose @ (se3_inverse(motions) if arch else motions)
+        place = transform_point(found.pose, self._coarse[other].centre)
+        correlation = ShiftCorrelation(views[0], other, _PX_PER_MM, _SHIFTS @ found.pose[:3, :3].T, place)
+        prices = np.array([self._outside_price(other, pose, views[0]) for pose in poses])
+        scores = correlation.objectives(self._coarse[other], poses).max(axis=1) - prices
+        best = np.argsort(scores)[::-1][:2]
+        heads = poses if arch else np.broadcast_to(found.pose, poses.shape)
+        return [(found.objective + scores[k], Pose(heads[k], self._jaws[k])) for k in best]
 
     def _outside_price(self, arch: int, pose: Array, view: View) -> float:
         """Return the penalty for crowns outside the mask, without which teeth near the camera would cover any mask."""
