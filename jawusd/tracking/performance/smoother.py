@@ -223,9 +223,11 @@ class Smoother:
             return fit.solution is not None and bool((attempts.wrong_masks(fit.solution, fit.use) & several).any())
 
         for k, fit in enumerate(fits):
-            if fit.missed.any() or doubtful(fit):
+            wrong = doubtful(fit)
+            if fit.missed.any() or wrong:
                 again = attempts.near(fit.pose, attempts.instant(self._views.at(self._frames[k])), _NEARBY)
-                if again.found.sum() > fit.found.sum() or (again.found >= fit.found).all() and not doubtful(again):
+                corrected = wrong and not doubtful(again) and bool((again.found >= fit.found).all())
+                if corrected or again.found.sum() > fit.found.sum():
                     fits[k] = again
         return fits
 
