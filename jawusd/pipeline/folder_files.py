@@ -173,8 +173,8 @@ def camera_names(paths: Sequence[PurePath]) -> dict[PurePath, str]:
 
 def fitting(name: str, paths: Iterable[PurePath]) -> list[PurePath]:
     """Return the paths that contain all words of a name."""
-    telling = set(words(PurePath(name)))
-    return [path for path in paths if telling <= set(words(path))]
+    wanted = set(words(PurePath(name)))
+    return [path for path in paths if wanted <= set(words(path))]
 
 
 def pair(names: Mapping[PurePath, str], others: Sequence[PurePath]) -> tuple[dict[PurePath, PurePath], bool]:

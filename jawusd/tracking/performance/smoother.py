@@ -218,15 +218,15 @@ class Smoother:
             return fits
         attempts = Attempts(self._instants, weight, usual_of(fits))
 
-        def doubtful(fit: FrameFit) -> bool:
+        def uses_wrong_mask(fit: FrameFit) -> bool:
             several = fit.use.sum(1, keepdims=True) > 1  # a single mask cannot be left out
             return fit.solution is not None and bool((attempts.wrong_masks(fit.solution, fit.use) & several).any())
 
         for k, fit in enumerate(fits):
-            wrong = doubtful(fit)
+            wrong = uses_wrong_mask(fit)
             if fit.missed.any() or wrong:
                 again = attempts.near(fit.pose, attempts.instant(self._views.at(self._frames[k])), _NEARBY)
-                corrected = wrong and not doubtful(again) and bool((again.found >= fit.found).all())
+                corrected = wrong and not uses_wrong_mask(again) and bool((again.found >= fit.found).all())
                 if corrected or again.found.sum() > fit.found.sum():
                     fits[k] = again
         return fits
