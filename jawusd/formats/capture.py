@@ -10,7 +10,7 @@ from pydantic import Field, ValidationError, field_validator, model_validator
 
 from jawusd.base.errors import AnyPath, FormatError, JawusdError, UnitsError
 from jawusd.base.npz import check_format
-from jawusd.formats.capture_keys import Key, KeyEntry, entries, key, optional, problems_of
+from jawusd.formats.capture_keys import Key, KeyEntry, entries, key, problems_of
 from jawusd.formats.capture_parts import Boards, CameraSource, Scans, resolve_paths, similar_names
 from jawusd.formats.text import Strict, read_toml
 from jawusd.geometry import rigidity_defect
@@ -28,43 +28,55 @@ class Sync(Strict):
     camera: frame k of the camera is simultaneous with frame k + offset of the reference camera.
     """
 
-    method: Literal["flash", "audio", "timecode", "numbers", "offsets"] = key(
-        '"flash": light flashes, or sound if there are none; "audio": sound only; "timecode": time codes of the '
-        'clips; "numbers": frame numbers of image sequences; "offsets": as given.',
-        default="flash",
-    )
-    reference: str | None = optional("Reference camera, whose frames are counted; default: the first.", '"left"')
-    offsets: dict[str, int] | None = optional(
-        "Per camera: its frame k is simultaneous with frame k + offset of the reference camera.",
-        "{ left = 0, right = 5 }",
-        "frames",
-    )
+    method: Annotated[
+        Literal["flash", "audio", "timecode", "numbers", "offsets"],
+        key(
+            '"flash": light flashes, or sound if there are none; "audio": sound only; "timecode": time codes of the '
+            'clips; "numbers": frame numbers of image sequences; "offsets": as given.'
+        ),
+    ] = "flash"
+    reference: Annotated[
+        str | None, key("Reference camera, whose frames are counted; default: the first.", '"left"')
+    ] = None
+    offsets: Annotated[
+        dict[str, int] | None,
+        key(
+            "Per camera: its frame k is simultaneous with frame k + offset of the reference camera.",
+            "{ left = 0, right = 5 }",
+            "frames",
+        ),
+    ] = None
 
 
 class PickView(Strict):
     """Pixel of a picked vertex in the recorded image of one camera (OpenCV coordinates)."""
 
-    camera: str = key("Name of the camera.", '"left"')
-    x: float = key("Pixel column; the centre of the first pixel is 0.", "651.5", "px")
-    y: float = key("Pixel row.", "250.4", "px")
+    camera: Annotated[str, key("Name of the camera.", '"left"')]
+    x: Annotated[float, key("Pixel column; the centre of the first pixel is 0.", "651.5", "px")]
+    y: Annotated[float, key("Pixel row.", "250.4", "px")]
 
 
 class Pick(Strict):
     """Picked vertex of a teeth scan, and its pixels in the images of several cameras."""
 
-    vertex: int = key("Index of a vertex of the scan, from 0 in file order; `jawusd view` writes it.", "0", ge=0)
-    views: tuple[PickView, ...] = key(
-        "Where it is seen, in two or more cameras.",
-        '[{ camera = "left", x = 651.5, y = 250.4 }, { camera = "right", x = 663.2, y = 290.4 }]',
-        "px",
-        min_length=2,
-    )
+    vertex: Annotated[
+        int, key("Index of a vertex of the scan, from 0 in file order; `jawusd view` writes it.", "0", ge=0)
+    ]
+    views: Annotated[
+        tuple[PickView, ...],
+        key(
+            "Where it is seen, in two or more cameras.",
+            '[{ camera = "left", x = 651.5, y = 250.4 }, { camera = "right", x = 663.2, y = 290.4 }]',
+            "px",
+            min_length=2,
+        ),
+    ]
 
 
 class Bootstrap(Strict):
     """Picked vertices that initialise tracking, in one frame of the reference camera."""
 
-    frame: int = key("Frame of the reference camera in which the points are picked.", "120", ge=0)
+    frame: Annotated[int, key("Frame of the reference camera in which the points are picked.", "120", ge=0)]
     upper: tuple[Pick, ...] = Field((), max_length=_MOST_PICKS)
     lower: tuple[Pick, ...] = Field((), max_length=_MOST_PICKS)
 
@@ -72,22 +84,27 @@ class Bootstrap(Strict):
 class MotionSection(Strict):
     """Rest frame: the video frame in which the teeth are in occlusion."""
 
-    rest_frame: int | None = optional(
-        "A frame with the teeth together; default: frames in occlusion are found automatically.", "46", ge=0
-    )
+    rest_frame: Annotated[
+        int | None,
+        key("A frame with the teeth together; default: frames in occlusion are found automatically.", "46", ge=0),
+    ] = None
 
 
 class AnatomySection(Strict):
     """Values that replace those derived from the scans."""
 
-    T_anatomical_skull: list[list[float]] | None = optional(
-        "4 x 4 matrix from the scans' frame to the anatomical one (x left, y up, z forward).", unit="mm"
-    )
-    landmarks: dict[str, tuple[float, float, float]] | None = optional(
-        "Points of mandible and ears (tragion_left, tragion_right) in the scans' frame, by name.",
-        "{ lower_incisor = [0.0, -1.0, 2.0] }",
-        "mm",
-    )
+    T_anatomical_skull: Annotated[
+        list[list[float]] | None,
+        key("4 x 4 matrix from the scans' frame to the anatomical one (x left, y up, z forward).", unit="mm"),
+    ] = None
+    landmarks: Annotated[
+        dict[str, tuple[float, float, float]] | None,
+        key(
+            "Points of mandible and ears (tragion_left, tragion_right) in the scans' frame, by name.",
+            "{ lower_incisor = [0.0, -1.0, 2.0] }",
+            "mm",
+        ),
+    ] = None
 
     @field_validator("T_anatomical_skull")
     @classmethod
@@ -103,25 +120,29 @@ class Capture(Strict):
     """Content of a capture.toml; paths are absolute after loading."""
 
     folder: Path
-    name: str = key(
-        "Name of the subject or take: letters, digits, spaces, _ - and dots.",
-        '"anna"',
-        min_length=1,
-        pattern=r"^[A-Za-z0-9_\-. ]+$",
-    )
-    fps: float = key("Frame rate of the clips.", "23.976", "frames per second", gt=0, le=10000)
-    frames: tuple[_FrameNumber, _FrameNumber] | None = optional(
-        "First frame, and one past the last, of the reference camera; default: all.", "[30, 270]", "frames"
-    )
-    calibration: Path | None = optional(
-        "Calibration of the cameras; default: calibrated from [boards].", '"calibration.toml"'
-    )
-    calibration_unit_mm: float = key(
-        "Length of the calibration's unit: 1000 if it is in metres.", "1000.0", "mm", default=1.0, gt=0, le=1e6
-    )
-    colour_config: Path | None = optional(
-        "OpenColorIO config that defines named colour spaces of the footage.", '"config.ocio"'
-    )
+    name: Annotated[
+        str,
+        key(
+            "Name of the subject or take: letters, digits, spaces, _ - and dots.",
+            '"anna"',
+            min_length=1,
+            pattern=r"^[A-Za-z0-9_\-. ]+$",
+        ),
+    ]
+    fps: Annotated[float, key("Frame rate of the clips.", "23.976", "frames per second", gt=0, le=10000)]
+    frames: Annotated[
+        tuple[_FrameNumber, _FrameNumber] | None,
+        key("First frame, and one past the last, of the reference camera; default: all.", "[30, 270]", "frames"),
+    ] = None
+    calibration: Annotated[
+        Path | None, key("Calibration of the cameras; default: calibrated from [boards].", '"calibration.toml"')
+    ] = None
+    calibration_unit_mm: Annotated[
+        float, key("Length of the calibration's unit: 1000 if it is in metres.", "1000.0", "mm", gt=0, le=1e6)
+    ] = 1.0
+    colour_config: Annotated[
+        Path | None, key("OpenColorIO config that defines named colour spaces of the footage.", '"config.ocio"')
+    ] = None
     scans: Scans
     cameras: tuple[CameraSource, ...] = Field(min_length=1, max_length=64, alias="camera")
     boards: Boards | None = None

@@ -5,11 +5,11 @@ from __future__ import annotations
 import difflib
 import json
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import NoneType, UnionType
-from typing import Annotated, Literal, TypeVar, Union, cast, get_args, get_origin
+from typing import Annotated, Literal, TypeVar, Union, get_args, get_origin
 
 from pydantic import BaseModel, Field, ValidationError
 from pydantic.fields import FieldInfo
@@ -55,15 +55,28 @@ class Key:
     unit: str = ""
 
 
-def key(meaning: str, example: str = "", unit: str = "", **limits: object) -> T:  # type: ignore[type-var]  # as Field
-    """Return a model field with its documentation (see `Key`), and pydantic's limits and default."""
-    make = cast("Callable[..., T]", Field)  # type: ignore[explicit-any]  # limits have several types
-    return make(description=meaning, json_schema_extra={"example": example, "unit": unit}, **limits)
-
-
-def optional(meaning: str, example: str = "", unit: str = "", **limits: object) -> T | None:
-    """Return a model field like `key`, with the default None."""
-    return key(meaning, example, unit, default=None, **limits)
+def key(
+    meaning: str,
+    example: str = "",
+    unit: str = "",
+    *,
+    gt: float | None = None,
+    ge: float | None = None,
+    le: float | None = None,
+    min_length: int | None = None,
+    pattern: str | None = None,
+) -> FieldInfo:
+    """Return the annotation of a model field: its documentation (see `Key`) and pydantic's limits."""
+    field: FieldInfo = Field(
+        description=meaning,
+        json_schema_extra={"example": example, "unit": unit},
+        gt=gt,
+        ge=ge,
+        le=le,
+        min_length=min_length,
+        pattern=pattern,
+    )
+    return field
 
 
 @dataclass(frozen=True)

@@ -7,12 +7,12 @@ import os
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Literal, TypeVar, cast
+from typing import Annotated, Literal, TypeVar, cast
 
 from pydantic import BaseModel, model_validator
 
 from jawusd.base.errors import CaptureError, JawusdError
-from jawusd.formats.capture_keys import Location, key, optional, place
+from jawusd.formats.capture_keys import Location, key, place
 from jawusd.formats.clips import ClipSource
 from jawusd.formats.file_names import is_pattern, wrong_kind
 from jawusd.formats.text import Strict
@@ -21,21 +21,22 @@ from jawusd.formats.text import Strict
 class Scans(Strict):
     """The meshes, in a common frame with the teeth in occlusion [mm]."""
 
-    upper_teeth: Path = key(
-        "Scan of the upper teeth: PLY, STL, OBJ or (with jawusd[dcm]) 3Shape DCM.", '"scans/upper.ply"', "mm"
-    )
-    lower_teeth: Path = key(
-        "Scan of the lower teeth, in the frame of the upper one, teeth in occlusion.", '"scans/lower.ply"', "mm"
-    )
-    mandible: Path | None = optional(
-        "Mesh of the whole mandible, same frame; default: a placeholder.", '"mandible.ply"', "mm"
-    )
-    skull: Path | None = optional("Mesh of the skull, same frame.", '"scans/skull.ply"', "mm")
-    labels: Path | None = optional("Folder of crown and gum labels; default: beside the scans.", '"labels"')
-    registration: Literal["scan", "take"] = key(
-        '"scan": keep both scans as given; "take": move the lower scan to the closed bite found in the take.',
-        default="scan",
-    )
+    upper_teeth: Annotated[
+        Path, key("Scan of the upper teeth: PLY, STL, OBJ or (with jawusd[dcm]) 3Shape DCM.", '"scans/upper.ply"', "mm")
+    ]
+    lower_teeth: Annotated[
+        Path,
+        key("Scan of the lower teeth, in the frame of the upper one, teeth in occlusion.", '"scans/lower.ply"', "mm"),
+    ]
+    mandible: Annotated[
+        Path | None, key("Mesh of the whole mandible, same frame; default: a placeholder.", '"mandible.ply"', "mm")
+    ] = None
+    skull: Annotated[Path | None, key("Mesh of the skull, same frame.", '"scans/skull.ply"', "mm")] = None
+    labels: Annotated[Path | None, key("Folder of crown and gum labels; default: beside the scans.", '"labels"')] = None
+    registration: Annotated[
+        Literal["scan", "take"],
+        key('"scan": keep both scans as given; "take": move the lower scan to the closed bite found in the take.'),
+    ] = "scan"
 
 
 class Masks(Strict):
@@ -46,12 +47,12 @@ class Masks(Strict):
     0 neither.
     """
 
-    upper: Path = key(
-        "Masks of the upper teeth: PNG files numbered as %06d, or a video.", '"masks/left/upper/%06d.png"'
-    )
-    lower: Path = key("Masks of the lower teeth.", '"masks/left/lower/%06d.png"')
-    upper_value: int | None = optional("With `labels`: gray value of the upper teeth.", "1", ge=1, le=65535)
-    lower_value: int | None = optional("With `labels`: gray value of the lower teeth.", "2", ge=1, le=65535)
+    upper: Annotated[
+        Path, key("Masks of the upper teeth: PNG files numbered as %06d, or a video.", '"masks/left/upper/%06d.png"')
+    ]
+    lower: Annotated[Path, key("Masks of the lower teeth.", '"masks/left/lower/%06d.png"')]
+    upper_value: Annotated[int | None, key("With `labels`: gray value of the upper teeth.", "1", ge=1, le=65535)] = None
+    lower_value: Annotated[int | None, key("With `labels`: gray value of the lower teeth.", "2", ge=1, le=65535)] = None
 
     @model_validator(mode="before")
     @classmethod
@@ -99,43 +100,66 @@ class Masks(Strict):
 class CameraSource(Strict):
     """The footage and masks of one camera."""
 
-    name: str = key(
-        "Name of the camera, as in the calibration: letters, digits, _ and -.",
-        '"left"',
-        min_length=1,
-        pattern=r"^[A-Za-z0-9_\-]+$",
-    )
-    video: Path | None = optional(
-        "Footage of the camera: a video, or an image sequence (PNG, TIFF, EXR, DPX, JPEG) such as left.%04d.exr, "
-        "left.####.exr or left.*.exr.",
-        '"left.mp4"',
-    )
+    name: Annotated[
+        str,
+        key(
+            "Name of the camera, as in the calibration: letters, digits, _ and -.",
+            '"left"',
+            min_length=1,
+            pattern=r"^[A-Za-z0-9_\-]+$",
+        ),
+    ]
+    video: Annotated[
+        Path | None,
+        key(
+            "Footage of the camera: a video, or an image sequence (PNG, TIFF, EXR, DPX, JPEG) such as left.%04d.exr, "
+            "left.####.exr or left.*.exr.",
+            '"left.mp4"',
+        ),
+    ] = None
     masks: Masks | None = None
-    timecode: str = key(
-        'Time code of the first frame, if the file has none; ";" before the frames for drop-frame counting.',
-        '"10:24:03:12"',
-        default="",
-    )
-    start_frame: int | None = optional(
-        'Number of the first frame for [sync] method = "numbers"; default: from the file name.', "1001", ge=0
-    )
-    fps: float | None = optional(
-        "Frame rate of an image sequence; default: that of the capture.", "23.976", "frames per second", gt=0, le=10000
-    )
-    colour_space: str | None = optional(
-        '"display", "linear" or "cineon", or a name in the OpenColorIO config; default: by file type (EXR: linear, '
-        "others: display).",
-        '"linear"',
-    )
-    colour_config: Path | None = optional(
-        "OpenColorIO config of this camera; default: that of the capture.", '"config.ocio"'
-    )
-    pixel_aspect: float | None = optional(
-        "Pixel aspect ratio, width over height; default: from the file. Used with calibrations of desqueezed images.",
-        "2.0",
-        ge=0.1,
-        le=10,
-    )
+    timecode: Annotated[
+        str,
+        key(
+            'Time code of the first frame, if the file has none; ";" before the frames for drop-frame counting.',
+            '"10:24:03:12"',
+        ),
+    ] = ""
+    start_frame: Annotated[
+        int | None,
+        key('Number of the first frame for [sync] method = "numbers"; default: from the file name.', "1001", ge=0),
+    ] = None
+    fps: Annotated[
+        float | None,
+        key(
+            "Frame rate of an image sequence; default: that of the capture.",
+            "23.976",
+            "frames per second",
+            gt=0,
+            le=10000,
+        ),
+    ] = None
+    colour_space: Annotated[
+        str | None,
+        key(
+            '"display", "linear" or "cineon", or a name in the OpenColorIO config; default: by file type (EXR: linear, '
+            "others: display).",
+            '"linear"',
+        ),
+    ] = None
+    colour_config: Annotated[
+        Path | None, key("OpenColorIO config of this camera; default: that of the capture.", '"config.ocio"')
+    ] = None
+    pixel_aspect: Annotated[
+        float | None,
+        key(
+            "Pixel aspect ratio, width over height; default: from the file. Used with calibrations of desqueezed "
+            "images.",
+            "2.0",
+            ge=0.1,
+            le=10,
+        ),
+    ] = None
 
     @model_validator(mode="after")
     def _has_source(self) -> CameraSource:
@@ -158,20 +182,30 @@ class Boards(Strict):
     as simultaneous. A ChArUco board also needs OpenCV's name of its marker dictionary, and the marker size.
     """
 
-    pattern: Literal["chessboard", "charuco"] = key("Type of board.", default="chessboard")
-    cols: int = key("Inner corners along a row: number of squares less one. 3 to 50.", "9", "corners", ge=3, le=50)
-    rows: int = key("Inner corners along a column.", "6", "corners", ge=3, le=50)
-    square_mm: float = key("Side of a square, measured on the printed board. Up to 200.", "8.0", "mm", gt=0, le=200)
-    videos: tuple[Path, ...] = key(
-        "Clip of the board per camera, in the order of the cameras: videos, or image sequences as %04d.",
-        '["board_left.mp4", "board_right.mp4"]',
-    )
-    dictionary: str | None = optional(
-        "ChArUco boards: OpenCV's name of the marker dictionary.",
-        '"DICT_5X5_100"',
-        pattern=r"^DICT_[4-7]X[4-7]_(50|100|250|1000)$",
-    )
-    marker_mm: float | None = optional("ChArUco boards: side of a marker.", "6.0", "mm", gt=0, le=200)
+    pattern: Annotated[Literal["chessboard", "charuco"], key("Type of board.")] = "chessboard"
+    cols: Annotated[
+        int, key("Inner corners along a row: number of squares less one. 3 to 50.", "9", "corners", ge=3, le=50)
+    ]
+    rows: Annotated[int, key("Inner corners along a column.", "6", "corners", ge=3, le=50)]
+    square_mm: Annotated[
+        float, key("Side of a square, measured on the printed board. Up to 200.", "8.0", "mm", gt=0, le=200)
+    ]
+    videos: Annotated[
+        tuple[Path, ...],
+        key(
+            "Clip of the board per camera, in the order of the cameras: videos, or image sequences as %04d.",
+            '["board_left.mp4", "board_right.mp4"]',
+        ),
+    ]
+    dictionary: Annotated[
+        str | None,
+        key(
+            "ChArUco boards: OpenCV's name of the marker dictionary.",
+            '"DICT_5X5_100"',
+            pattern=r"^DICT_[4-7]X[4-7]_(50|100|250|1000)$",
+        ),
+    ] = None
+    marker_mm: Annotated[float | None, key("ChArUco boards: side of a marker.", "6.0", "mm", gt=0, le=200)] = None
 
     @model_validator(mode="after")
     def _describes_markers(self) -> Boards:

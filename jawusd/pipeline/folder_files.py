@@ -160,8 +160,8 @@ def camera_names(paths: Sequence[PurePath]) -> dict[PurePath, str]:
     shared = set.intersection(*(set(own) for own in own_words.values())) if len(own_words) > 1 else set()
     out: dict[PurePath, str] = {}
     for path, own in own_words.items():
-        telling = dict.fromkeys(word for word in own if word not in shared | _BOARD | _GENERIC)
-        out[path] = "_".join(telling) or "_".join(words(PurePath(path.name))) or "camera"
+        distinct = dict.fromkeys(word for word in own if word not in shared | _BOARD | _GENERIC)
+        out[path] = "_".join(distinct) or "_".join(words(PurePath(path.name))) or "camera"
     stems = [PurePath(path.name).stem for path in paths]
     plain = [re.sub(r"[^A-Za-z0-9_\-]+", "_", re.sub(r"%0?\d*d", "", stem)).strip("_.-") for stem in stems]
     if len(set(out.values())) < len(paths) or any(len(name) > 40 for name in out.values()):
