@@ -37,9 +37,7 @@ DAMAGED = (
 def read_npz(path: AnyPath, family: str, version: int) -> tuple[NamedArrays, JsonObject]:
     """Read the arrays and metadata of a jawusd npz file, and check format, version and units.
 
-    Args:
-        family: Format name without version, e.g. ``"jawusd-tracks"``.
-        version: Newest supported version.
+    `family` is the format's name without version, such as "jawusd-tracks"; `version` is the newest supported one.
 
     Raises:
         FormatError: the file is not of this family, or is damaged.
@@ -138,9 +136,7 @@ def upgraded_model(arrays: NamedArrays, path: object) -> NamedArrays:
 def take(arrays: NamedArrays, name: str, shape: tuple[int | None, ...], path: object, *, finite: bool = True) -> Array:
     """Return one of the arrays of `read_npz` after checking its shape and finiteness.
 
-    Args:
-        shape: Required shape, None for any length.
-        finite: Reject NaN and infinity.
+    `shape` has None for any length; `finite` rejects NaN and infinity.
 
     Raises:
         FormatError: the array is missing, has another shape, or is not finite.
@@ -156,3 +152,16 @@ def take(arrays: NamedArrays, name: str, shape: tuple[int | None, ...], path: ob
     if finite and value.dtype.kind == "f" and not np.isfinite(value).all():
         raise FormatError(f'"{name}" has values that are not finite.', path=str(path))
     return value
+
+
+def fields_of_shapes(record: object, shapes: Mapping[str, tuple[int, ...]], what: str) -> NamedArrays:
+    """Return fields of a record as arrays by name, for a file; `shapes` are those that they must have.
+
+    Raises:
+        ValueError: a field has another shape; the message calls the record `what`.
+    """
+    arrays = {name: np.asarray(getattr(record, name)) for name in shapes}
+    for name, value in arrays.items():
+        if value.shape != shapes[name]:
+            raise ValueError(f"{what}.{name} has shape {value.shape}; expected {shapes[name]}")
+    return arrays

@@ -7,7 +7,6 @@ covariances.
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Sequence
 
@@ -16,11 +15,10 @@ from numpy.typing import ArrayLike
 
 from jawusd.base.arrays import Array, Indices
 from jawusd.base.errors import FittingError
-from jawusd.base.npz import TWIST_ORDER, UNITS
 from jawusd.evaluator import JawRig
 from jawusd.evaluator.skin import FAMILY, VERSION, Skin, components, skin_kernel
 from jawusd.fitting import face
-from jawusd.formats.atomic import write_npz_atomic
+from jawusd.formats.atomic import write_described_npz
 
 #: Default root mean square shift [mm] and rotation [rad] of the head that remain in later frames after stabilisation,
 #: in addition to those in the training frames.
@@ -145,8 +143,7 @@ def _explained(f: Array, d: Array) -> float:
 
 def save_skin(path: str | os.PathLike[str], skin: Skin) -> None:
     """Write a map of format jawusd-skin/1 atomically; raises OutputError if that fails."""
-    meta = {"units": UNITS, "twist_order": TWIST_ORDER, **skin.meta, "format": f"{FAMILY}/{VERSION}"}
-    write_npz_atomic(path, {**skin.arrays, "meta": np.array(json.dumps(meta, sort_keys=True))})
+    write_described_npz(path, f"{FAMILY}/{VERSION}", skin.arrays, skin.meta)
 
 
 def _process(flat: Array, d: Array, sigma: Array, blocks: list[Indices]) -> tuple[dict[str, Array], Array, Array]:

@@ -6,6 +6,7 @@ import contextlib
 import csv
 import errno
 import io
+import json
 import os
 import shutil
 import stat
@@ -252,3 +253,17 @@ def write_npz_atomic(path: AnyPath, arrays: Mapping[str, ArrayLike], *, packed: 
     # numpy stamps every member with 1980-01-01, so equal content gives equal bytes.
     (np.savez_compressed if packed else np.savez)(buffer, allow_pickle=False, **rows)
     write_bytes_atomic(path, buffer.getvalue())
+
+
+def write_described_npz(
+    path: AnyPath, form: str, arrays: Mapping[str, ArrayLike], meta: Mapping[str, object], *, packed: bool = True
+) -> None:
+    """Write arrays and metadata as `base.npz.read_npz` reads them; `form` is the format, such as "jawusd-model/2".
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    from jawusd.base.npz import TWIST_ORDER, UNITS  # imported late, as in `write_npz_atomic`
+
+    text = json.dumps({"units": UNITS, "twist_order": TWIST_ORDER, **meta, "format": form}, sort_keys=True)
+    write_npz_atomic(path, {**arrays, "meta": text}, packed=packed)

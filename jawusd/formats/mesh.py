@@ -11,7 +11,6 @@ The hash identifies the version of the scan for which labels were made; they are
 from __future__ import annotations
 
 import hashlib
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, NamedTuple
@@ -21,8 +20,8 @@ from numpy.typing import NDArray
 
 from jawusd.base.arrays import Array, Mask
 from jawusd.base.errors import AnyPath, FormatError
-from jawusd.base.npz import TWIST_ORDER, UNITS, read_npz, take
-from jawusd.formats.atomic import write_npz_atomic
+from jawusd.base.npz import read_npz, take
+from jawusd.formats.atomic import write_described_npz
 
 GUM, TOOTH, BOUNDARY, BASE = 0, 1, 2, 3
 
@@ -51,12 +50,10 @@ class Mesh:
             raise ValueError(f"a mesh needs vertices (V, 3) and faces (F, 3), got {vertices.shape} and {faces.shape}")
         if len(faces) and (faces.min() < 0 or faces.max() >= len(vertices)):
             raise ValueError(f"faces refer to vertex {faces.max()}, but the mesh has {len(vertices)} vertices")
-        if self.colors is not None and np.shape(self.colors) != vertices.shape:
-            raise ValueError(f"colors must have shape {vertices.shape}, got {np.shape(self.colors)}")
-        if self.labels is not None and np.shape(self.labels) != vertices.shape[:1]:
-            raise ValueError(f"labels must have shape {vertices.shape[:1]}, got {np.shape(self.labels)}")
-        if self.uv is not None and np.shape(self.uv) != (*faces.shape, 2):
-            raise ValueError(f"uv must have shape {(*faces.shape, 2)}, got {np.shape(self.uv)}")
+        shapes = {"colors": vertices.shape, "labels": vertices.shape[:1], "uv": (*faces.shape, 2)}
+        for name, shape in shapes.items():
+            if (value := getattr(self, name)) is not None and np.shape(value) != shape:
+                raise ValueError(f"{name} must have shape {shape}, got {np.shape(value)}")
         object.__setattr__(self, "vertices", vertices)
         object.__setattr__(self, "faces", faces)
 
@@ -160,16 +157,9 @@ def save_scan_labels(path: AnyPath, labels: ScanLabels, mesh: Mesh) -> None:
     """
     if labels.labels.shape != mesh.vertices.shape[:1]:
         raise ValueError(f"labels must have shape ({len(mesh.vertices)},), got {labels.labels.shape}")
-    meta = {
-        "format": f"{LABELS_FAMILY}/{LABELS_VERSION}",
-        "units": UNITS,
-        "twist_order": TWIST_ORDER,
-        "scan_sha256": scan_hash(mesh),
-        "source": labels.source,
-        "weak_share": labels.weak_share,
-    }
-    text = json.dumps(meta, sort_keys=True)
-    write_npz_atomic(path, {"labels": labels.labels.astype(np.uint8), "meta": np.array(text)})
+    meta = {"scan_sha256": scan_hash(mesh), "source": labels.source, "weak_share": labels.weak_share}
+    arrays = {"labels": labels.labels.astype(np.uint8)}
+    write_described_npz(path, f"{LABELS_FAMILY}/{LABELS_VERSION}", arrays, meta)
 
 
 def load_scan_labels(path: AnyPath, mesh: Mesh) -> ScanLabels:

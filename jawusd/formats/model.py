@@ -5,7 +5,6 @@ The decoder arrays (`JawModel.arrays`) have the names of the evaluator, which va
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import cast
@@ -15,8 +14,8 @@ from numpy.typing import NDArray
 
 from jawusd.base.arrays import Array, Mask
 from jawusd.base.errors import AnyPath
-from jawusd.base.npz import TWIST_ORDER, UNITS, read_npz, take, upgraded_model
-from jawusd.formats.atomic import write_npz_atomic
+from jawusd.base.npz import read_npz, take, upgraded_model
+from jawusd.formats.atomic import write_described_npz
 from jawusd.formats.notes import ErrorTable, ModelMeta, check_notes
 
 FAMILY, VERSION = "jawusd-model", 2
@@ -68,8 +67,7 @@ def save_model(path: AnyPath, model: JawModel) -> None:
     for name, value in captured.items():
         if len(value) != count:
             raise ValueError(f"{name} has {len(value)} rows, expected {count}")
-    meta = {"units": UNITS, "twist_order": TWIST_ORDER, **model.meta, "format": f"{FAMILY}/{VERSION}"}
-    write_npz_atomic(path, {**model.arrays, **captured, "meta": np.array(json.dumps(meta, sort_keys=True))})
+    write_described_npz(path, f"{FAMILY}/{VERSION}", {**model.arrays, **captured}, model.meta)
 
 
 def load_model(path: AnyPath) -> JawModel:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from jawusd.base.arrays import Array, Mask
 from jawusd.base.errors import AnyPath, FormatError
-from jawusd.base.npz import NamedArrays, take
+from jawusd.base.npz import NamedArrays, fields_of_shapes, take
 from jawusd.formats.atomic import write_text_atomic
 
 HEADER = ("frame", "time_s", "d1", "d2", "d3", "sigma1", "sigma2", "sigma3", "margin_mm", "verdict", "state")
@@ -109,13 +109,8 @@ class SolvedJaw:
         Raises:
             ValueError: an array has the wrong shape.
         """
-        found = {}
-        for name, shape in _shapes(len(self.d)).items():
-            value = np.asarray(getattr(self, name))
-            if value.shape != shape:
-                raise ValueError(f"solved.{name} has shape {value.shape}; expected {shape}")
-            found[_PREFIX + name] = value
-        return found
+        found = fields_of_shapes(self, _shapes(len(self.d)), "solved")
+        return {_PREFIX + name: value for name, value in found.items()}
 
 
 def take_solved(arrays: NamedArrays, count: int, path: AnyPath) -> SolvedJaw | None:

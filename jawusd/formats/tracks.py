@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
@@ -13,8 +12,8 @@ from numpy.typing import NDArray
 
 from jawusd.base.arrays import Array, Mask
 from jawusd.base.errors import AnyPath, FormatError
-from jawusd.base.npz import TWIST_ORDER, UNITS, read_npz, take
-from jawusd.formats.atomic import write_npz_atomic
+from jawusd.base.npz import fields_of_shapes, read_npz, take
+from jawusd.formats.atomic import write_described_npz
 from jawusd.formats.notes import TracksMeta, check_notes
 from jawusd.formats.performance import SolvedJaw, take_solved
 from jawusd.geometry import LANDMARKS, rigidity_defect
@@ -162,23 +161,15 @@ def save_tracks(path: AnyPath, tracks: Tracks) -> None:
         OutputError: the file cannot be written.
         ValueError: an array has the wrong shape.
     """
-    arrays: dict[str, Array] = {}
-    for name, shape in _shapes(len(tracks.frames), len(tracks.camera_names)).items():
-        value = np.asarray(getattr(tracks, name))
-        if value.shape != shape:
-            raise ValueError(f"tracks.{name} has shape {value.shape}; expected {shape}")
-        arrays[name] = value
+    arrays = fields_of_shapes(tracks, _shapes(len(tracks.frames), len(tracks.camera_names)), "tracks")
     arrays |= tracks.solved.arrays() if tracks.solved else {}
     meta = {
-        "units": UNITS,
-        "twist_order": TWIST_ORDER,
         "frames": "T_a_b maps b to a; world, upper = skull, lower = mandible",
         **tracks.meta,
-        "format": f"{FAMILY}/{VERSION}",
         "camera_names": list(tracks.camera_names),
         "landmark_names": list(LANDMARKS),
     }
-    write_npz_atomic(path, {**arrays, "meta": np.array(json.dumps(meta, sort_keys=True))})
+    write_described_npz(path, f"{FAMILY}/{VERSION}", arrays, meta)
 
 
 def load_tracks(path: AnyPath) -> Tracks:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -10,8 +9,8 @@ import numpy as np
 
 from jawusd.base.arrays import Array
 from jawusd.base.errors import JawusdError
-from jawusd.base.npz import TWIST_ORDER, UNITS, read_npz, take
-from jawusd.formats.atomic import write_npz_atomic
+from jawusd.base.npz import read_npz, take
+from jawusd.formats.atomic import write_described_npz
 from jawusd.formats.capture import Capture
 from jawusd.formats.finding import Finding
 from jawusd.formats.tracks import Tracks
@@ -35,11 +34,10 @@ def save_guide(folder: Path, inputs: str, guide: Mapping[int, RegionPose]) -> No
         OutputError: the file cannot be written.
     """
     frames = sorted(guide)
-    meta = {"format": f"{_FAMILY}/1", "units": UNITS, "twist_order": TWIST_ORDER, "inputs": inputs}
-    arrays = {"meta": np.array(json.dumps(meta)), "frames": np.array(frames)}
-    for name in ("poses", "found", "covariance"):
-        arrays[name] = np.stack([getattr(guide[frame], name) for frame in frames])
-    write_npz_atomic(folder / GUIDE, arrays, packed=False)
+    fields = ("poses", "found", "covariance")
+    arrays = {name: np.stack([getattr(guide[frame], name) for frame in frames]) for name in fields}
+    arrays["frames"] = np.array(frames)
+    write_described_npz(folder / GUIDE, f"{_FAMILY}/1", arrays, {"inputs": inputs}, packed=False)
 
 
 def known_guide(folder: Path, inputs: str) -> dict[int, RegionPose]:
