@@ -209,7 +209,7 @@ def with_bootstrap(text: str, picks: Bootstrap) -> str:
     newline = "\r\n" if "\r\n" in text else "\n"
     own = [number for number, (table, _) in enumerate(blocks) if table == _TABLE]
     comments = [line for number in own for line in _comments(blocks[number][1], last=number == own[-1])]
-    fresh = newline.join([f"[{_TABLE}]", *comments, *_lines(picks)]) + newline
+    fresh = newline.join([f"[{_TABLE}]", *comments, *pick_lines(picks)]) + newline
     if own:
         rest = ["".join(lines) for number, (_, lines) in enumerate(blocks) if number not in own]
         tail = "".join(_after(blocks[own[-1]][1])) or newline * (len(rest) > own[0])
@@ -221,7 +221,8 @@ def with_bootstrap(text: str, picks: Bootstrap) -> str:
     return changed
 
 
-def _lines(picks: Bootstrap) -> list[str]:
+def pick_lines(picks: Bootstrap) -> list[str]:
+    """Return the lines of picked points in a capture.toml, without the header of their table."""
     lines = [f"frame = {picks.frame}"]
     for arch, picked in (("upper", picks.upper), ("lower", picks.lower)):
         for pick in picked:
@@ -281,6 +282,6 @@ def _check(before: str, after: str, picks: Bootstrap) -> None:
     except (tomllib.TOMLDecodeError, ValidationError) as error:
         raise ValueError(f"[{_TABLE}] is not written as separate tables") from error
     old.pop(_TABLE, None)
-    rounded = Bootstrap.model_validate(tomllib.loads("\n".join(_lines(picks)).replace(f"[[{_TABLE}.", "[[")))
+    rounded = Bootstrap.model_validate(tomllib.loads("\n".join(pick_lines(picks)).replace(f"[[{_TABLE}.", "[[")))
     if old != new or written != rounded:
         raise ValueError(f"[{_TABLE}] is not written as separate tables")

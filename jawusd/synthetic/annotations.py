@@ -92,7 +92,7 @@ def choose_picks(
     count: int,
     noise_px: float,
     rng: np.random.Generator,
-) -> list[Pick]:
+) -> tuple[Pick, ...]:
     """Choose `count` well-distributed tips and corners of teeth that are visible in at least two cameras.
 
     Args:
@@ -118,7 +118,7 @@ def choose_picks(
             x, y = cameras[c].project(points[k]) + rng.normal(0.0, noise_px, 2)
             views.append(PickView(camera=cameras[c].name, x=float(x), y=float(y)))
         picks.append(Pick(vertex=int(candidates[k]), views=tuple(views)))
-    return picks
+    return tuple(picks)
 
 
 def _tips(arch: DentalArch) -> NDArray[np.int64]:

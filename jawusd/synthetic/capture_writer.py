@@ -14,7 +14,8 @@ from numpy.typing import ArrayLike, NDArray
 from jawusd.base.arrays import Array
 from jawusd.cameras.calibration import save_calibration
 from jawusd.formats.atomic import write_bytes_atomic, write_npz_atomic, write_text_atomic
-from jawusd.formats.capture import Pick
+from jawusd.formats.capture import Bootstrap, Pick
+from jawusd.formats.capture_writing import pick_lines
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry import LANDMARKS, Camera
 from jawusd.media.writers import VideoWriter
@@ -130,7 +131,7 @@ class _Recorder:
         self._rng = [np.random.default_rng([config.seed, 0xCA3, k]) for k in range(len(cameras))]
         shape = (_NOISE_PATTERNS, config.size_px[1], config.size_px[0], 3)
         self._grain = np.rint(self._rng[0].normal(0.0, _SENSOR_NOISE, shape)).astype(np.int8)
-        self.picks: dict[str, list[Pick]] = {}
+        self.picks: dict[str, tuple[Pick, ...]] = {}
 
     def performance(self, scene: Scene, take: Take) -> None:
         """Record videos and masks of the exercises, and the picks in the first tracked frame."""
@@ -241,7 +242,7 @@ def _truth(person: Person, cameras: list[Camera], take: Take, T_world_board: Arr
     }
 
 
-def _description(config: DemoConfig, cameras: list[Camera], take: Take, picks: dict[str, list[Pick]]) -> str:
+def _description(config: DemoConfig, cameras: list[Camera], take: Take, picks: dict[str, tuple[Pick, ...]]) -> str:
     """Return the text of capture.toml."""
     lines = [
         'format = "jawusd-capture/1"',
@@ -262,10 +263,6 @@ def _description(config: DemoConfig, cameras: list[Camera], take: Take, picks: d
     lines += ["[boards]", 'pattern = "chessboard"', f"cols = {BOARD_COLUMNS}", f"rows = {BOARD_ROWS}"]
     lines += [f"square_mm = {SQUARE_MM}", f"videos = [{videos}]", ""]
     lines += ["[sync]", 'method = "flash"', f'reference = "{cameras[0].name}"', ""]
-    lines += ["[bootstrap]", f"frame = {take.tracked[0]}", ""]
-    for jaw in ("upper", "lower"):
-        for pick in picks[jaw]:
-            views = ", ".join(f'{{ camera = "{one.camera}", x = {one.x:.2f}, y = {one.y:.2f} }}' for one in pick.views)
-            lines += [f"[[bootstrap.{jaw}]]", f"vertex = {pick.vertex}", f"views = [{views}]", ""]
-    lines += ["[motion]", f"rest_frame = {take.rest_frame}", ""]
+    lines += ["[bootstrap]", *pick_lines(Bootstrap(frame=take.tracked[0], upper=picks["upper"], lower=picks["lower"]))]
+    lines += ["", "[motion]", f"rest_frame = {take.rest_frame}", ""]
     return "\n".join(lines)
