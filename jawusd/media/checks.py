@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -18,7 +17,7 @@ from jawusd.formats.file_names import gaps
 from jawusd.formats.finding import Finding
 from jawusd.media.clip import INTERLACED, INTERLACED_HINT, Clip
 from jawusd.media.footage import PictureSequence
-from jawusd.media.mask_levels import MOST_SOFT, MaskImage, MaskLevels
+from jawusd.media.mask_levels import MOST_SOFT, MaskLevels
 from jawusd.media.masks import MaskReader, open_masks
 
 # Maximum drift between cameras over a take [frames]; larger drifts are reported.
@@ -269,41 +268,34 @@ def _of_levels(source: CameraSource, rows: str, levels: MaskLevels) -> Iterator[
         )
 
 
-@dataclass(frozen=True, eq=False)
 class MaskSamples:
-    """Samples of the masks of one camera, by frame number of the camera itself."""
+    """Samples of the masks of one camera over a whole clip, by frame number of the camera itself.
 
-    counts: tuple[int, int]  # numbers of frames of the upper and the lower mask source
-    # First and last frame with a mask, for the upper and the lower arch; None if the arch has no masks.
-    first_last: tuple[tuple[int, int] | None, tuple[int, int] | None]
-    read: Callable[[int, int], MaskImage | None]  # reads the mask of an arch (0 upper, 1 lower) in a frame
+    Attributes:
+        counts: numbers of frames of the upper and the lower mask source.
+        first_last: first and last frame with a mask, for the upper and the lower arch; None if the arch has no masks.
+        first_frame: first frame with a mask of either arch, or None.
+    """
 
-    @property
-    def first_frame(self) -> int | None:
-        """Return the first frame with a mask of either arch."""
-        return min((frames[0] for frames in self.first_last if frames is not None), default=None)
+    def __init__(self, source: CameraSource, size_px: tuple[int, int], files: ExitStack) -> None:
+        """Sample the masks of a camera with images (width, height); the exit stack closes the masks.
+
+        Raises:
+            CaptureError: masks are missing, damaged, of the wrong size, or not masks.
+        """
+        upper, lower = self._readers = [files.enter_context(reader) for reader in open_masks(source, size_px)]
+        self.counts = upper.count, lower.count
+        self.first_last = _first_last(upper), _first_last(lower)
+        self.first_frame = min((frames[0] for frames in self.first_last if frames is not None), default=None)
 
     def pixels(self, arch: int, frame: int) -> Array:
-        """Return at most 500 sampled pixels (x, y) of a mask, shape (N, 2); N = 0 if there is no mask."""
-        mask = self.read(arch, frame)
+        """Return at most 500 pixels (x, y) of the mask of an arch (0 upper, 1 lower), (N, 2); N = 0 without a mask."""
+        mask = self._readers[arch].read(frame)
         if mask is None:
             return np.empty((0, 2))
         y, x = np.nonzero(mask >= _HALF)
         chosen = slice(None, None, max(1, len(x) // _POINTS))
         return np.stack([x[chosen], y[chosen]], axis=1).astype(np.float64)
-
-
-def sample_masks(source: CameraSource, size_px: tuple[int, int], files: ExitStack) -> MaskSamples:
-    """Sample the masks of a camera over a whole clip with images (width, height); the exit stack closes the masks.
-
-    Raises:
-        CaptureError: masks are missing, damaged, of the wrong size, or not masks.
-    """
-    pair = [files.enter_context(reader) for reader in open_masks(source, size_px)]
-    ranges = tuple(_first_last(reader) for reader in pair)
-    return MaskSamples(
-        (pair[0].count, pair[1].count), (ranges[0], ranges[1]), lambda arch, frame: pair[arch].read(frame)
-    )
 
 
 def _first_last(reader: MaskReader) -> tuple[int, int] | None:

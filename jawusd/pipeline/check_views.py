@@ -20,7 +20,7 @@ _CROWN_POINTS = 6000
 
 def masks(parts: Parts) -> Iterator[Finding]:
     """Check a sample of the masks of every camera."""
-    from jawusd.media.checks import sample_masks, survey_masks
+    from jawusd.media.checks import MaskSamples, survey_masks
     from jawusd.media.masks import mask_size_px
 
     capture = parts.given
@@ -44,7 +44,7 @@ def masks(parts: Parts) -> Iterator[Finding]:
             video = parts.videos.get(source.name)
             size = known.size_px if known else video.size_px if video else mask_size_px(source.masks.upper)
             yield from survey_masks(source, size)
-            sample = sample_masks(source, size, parts.open_files)
+            sample = MaskSamples(source, size, parts.open_files)
         except JawusdError as error:
             missing = True
             yield replace(found_error("masks", error), camera=source.name)

@@ -310,7 +310,7 @@ def test_the_program_prints_findings_and_leaves_with_5(capture, monkeypatch):
 
 def test_a_black_picture_in_between_does_not_end_the_masks(tmp_path):
     from jawusd.formats.capture_parts import CameraSource, Masks
-    from jawusd.media.checks import sample_masks
+    from jawusd.media.checks import MaskSamples
 
     for k in range(40):
         picture = np.zeros((90, 160), np.uint8)
@@ -321,7 +321,7 @@ def test_a_black_picture_in_between_does_not_end_the_masks(tmp_path):
     from contextlib import ExitStack
 
     with ExitStack() as files:
-        sample = sample_masks(CameraSource(name="cam", masks=masks), (160, 90), files)
+        sample = MaskSamples(CameraSource(name="cam", masks=masks), (160, 90), files)
         assert sample.first_last[0] == (7, 33) and sample.first_frame == 7
         assert len(sample.pixels(0, 8)) > 100 and len(sample.pixels(0, 3)) == 0
 
