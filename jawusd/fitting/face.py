@@ -11,6 +11,7 @@ from jawusd.evaluator import JawRig
 from jawusd.fitting.data import PARAMETERS
 from jawusd.formats.arkit import shares_of
 from jawusd.geometry import make_transform, se3_exp, se3_inverse, transform_points
+from jawusd.geometry.so3 import nearest_rotation
 
 COARSE_S, _FINE_S, _FINE_STEPS = 0.1, 0.01, 15  # offset search: coarse and fine step [s], number of fine steps per side
 _LEAST_SECONDS = 10.0
@@ -202,8 +203,7 @@ def on_bone(rig: JawRig, X: Array, poses: Array) -> tuple[Array, Array, Indices]
     swing = transform_points(poses, rig.landmarks[:1])[:, 0]
     moved = X.mean(axis=1)
     # The skin follows the incisal point, so the search starts from the rotation between the two point clouds.
-    U, _, Vt = np.linalg.svd((swing - swing.mean(axis=0)).T @ (moved - moved.mean(axis=0)))
-    R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt  # Kabsch 1976
+    R = nearest_rotation((swing - swing.mean(axis=0)).T @ (moved - moved.mean(axis=0)))
     start = make_transform(R, rig.landmarks[0] - R @ X.mean(axis=(0, 1)))
 
     def residual(unknown: Array, chosen: Indices) -> Array:

@@ -16,6 +16,7 @@ from jawusd.base.arrays import Array
 from jawusd.evaluator.encoding import landmark_vectors, nearest_in_chart, vector_images
 from jawusd.evaluator.models import JawModelForm
 from jawusd.geometry import hat, make_transform
+from jawusd.geometry.so3 import nearest_rotation
 
 _TOGETHER = 32  # number of poses per block, small enough that displacements stay in the CPU cache
 _EVERY = 32  # stride through the hull vertices in `largest_at_least`
@@ -67,10 +68,8 @@ class MandibleMetric:
         mean, root = self.vectors[:3, 3], self.vectors[:3, :3]
         arm = mean - incisor
         second = root @ root.T + np.outer(arm, mean)  # mean of (x - p) x^T
-        U, _, Vt = np.linalg.svd(second @ np.swapaxes(R, 1, 2) + arm[:, None] * (t - at)[:, None, :])
-        sign = np.ones((len(target), 3))
-        sign[:, 2] = np.linalg.det(U @ Vt)
-        return np.swapaxes(U * sign[:, None, :] @ Vt, 1, 2)
+        moments = second @ np.swapaxes(R, 1, 2) + arm[:, None] * (t - at)[:, None, :]
+        return np.swapaxes(nearest_rotation(moments), 1, 2)
 
     def about(self, point: Array) -> Array:
         """Return the inertia about a point: w^T I w = mean squared displacement under a rotation w [mm^2/rad^2]."""

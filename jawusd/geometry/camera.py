@@ -176,13 +176,9 @@ def opencv_lens(K: Array, recorded_px: Array, ideal: Array) -> tuple[Array, Arra
     K is kept if the coefficients alone fit the lens. Otherwise K is fitted too, which covers linear effects such as an
     anamorphic squeeze; then the camera rotation, which with the principal point moves the centre of distortion.
 
-    Args:
-        recorded_px: Points of the recorded image (N, 2) [px].
-        ideal: The same points without distortion, on the plane at depth 1, x right, y down, shape (N, 2).
-
-    Returns:
-        K (3, 3), the coefficients (8,), the rotation vector (3,) [rad] applied to the ideal points first, and the
-        largest error [px], infinite if the fit fails.
+    `recorded_px` (N, 2) are points of the recorded image, `ideal` (N, 2) the same points without distortion, on the
+    plane at depth 1, x right, y down. Return K (3, 3), the coefficients (8,), the rotation vector (3,) [rad] applied to
+    the ideal points first, and the largest error [px], infinite if the fit fails.
     """
     best, off = np.concatenate([K[[0, 1, 0, 0, 1], [0, 1, 1, 2, 2]], np.zeros(11)]), np.inf
     for free in (np.arange(5, 13), np.arange(13), np.arange(16)):

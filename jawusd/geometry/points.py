@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from jawusd.base.arrays import Array
 from jawusd.geometry.se3 import make_transform, transform_points
+from jawusd.geometry.so3 import nearest_rotation
 
 _Number = TypeVar("_Number", np.float64, np.int64)
 
@@ -18,10 +19,8 @@ _MIN_ASPECT = 1e-6  # ratio of the second-largest to the largest extent of point
 def rigid_fit(source: ArrayLike, target: ArrayLike, weights: ArrayLike | None = None) -> Array:
     """Return the rigid T (..., 4, 4) minimising sum w |T source - target|^2 (Arun et al. 1987, Umeyama 1991).
 
-    Args:
-        source: Points [mm], shape (N, 3), N >= 3, not collinear.
-        target: points [mm], one set or many, shape (..., N, 3).
-        weights: non-negative, shape (N,).
+    `source` (N, 3) [mm] are at least three points, not collinear; `target` (..., N, 3) [mm] is one set or many;
+    `weights` (N,) are not negative.
 
     Raises:
         ValueError: the shapes are wrong, or the points are fewer than three or collinear.
@@ -35,23 +34,15 @@ def rigid_fit(source: ArrayLike, target: ArrayLike, weights: ArrayLike | None = 
     spread = np.linalg.svd((P - p0) * np.sqrt(w)[:, None], compute_uv=False)
     if spread[1] < 1e-9 * max(spread[0], 1e-300):
         raise ValueError("the source points are collinear, so the rotation about their line is undetermined")
-    U, _, Vt = np.linalg.svd(((P - p0) * w[:, None]).T @ (Q - q0[..., None, :]))
-    sign = np.ones((*U.shape[:-2], 1, 3))
-    sign[..., 0, 2] = np.sign(np.linalg.det(U @ Vt))
-    R = np.swapaxes((U * sign) @ Vt, -1, -2)
+    R = np.swapaxes(nearest_rotation(((P - p0) * w[:, None]).T @ (Q - q0[..., None, :])), -1, -2)
     return make_transform(R, q0 - R @ p0)
 
 
 def rigid_fits(source: ArrayLike, targets: ArrayLike) -> tuple[Array, Array]:
-    """Return the rigid motions of a point set in frames with missing points, each by `rigid_fit`.
+    """Return the rigid motions of points (N, 3) [mm] to targets (F, N, 3) [mm], NaN if missing, each by `rigid_fit`.
 
-    Args:
-        source: points [mm], shape (N, 3).
-        targets: The points after each motion [mm], shape (F, N, 3), NaN if missing.
-
-    Returns:
-        T (F, 4, 4), and the rms distance (F,) [mm] over the points present; both NaN in frames with fewer than three
-        points or collinear ones.
+    Return T (F, 4, 4), and the rms distance (F,) [mm] over the points present; both are NaN in frames with fewer than
+    three points or collinear ones.
 
     Raises:
         ValueError: the shapes are wrong.
@@ -78,14 +69,10 @@ def _on_a_line(points: Array) -> bool:
 
 
 def triangulate(projections: ArrayLike, pixels: ArrayLike) -> Array:
-    """Return the world point (3,) [mm] that projects to the given pixels.
+    """Return the world point (3,) [mm] that pinhole projections (C, 3, 4), C >= 2, map to undistorted pixels (C, 2).
 
     A linear estimate (Hartley & Zisserman, Multiple View Geometry, section 12.2), refined by Gauss-Newton on
     the reprojection error.
-
-    Args:
-        projections: pinhole projection matrices (world mm -> px), shape (C, 3, 4), C >= 2.
-        pixels: undistorted image points [px], shape (C, 2).
 
     Raises:
         ValueError: the shapes are wrong, or there are fewer than two views.

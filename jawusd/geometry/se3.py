@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from jawusd.base.arrays import Array
-from jawusd.geometry.so3 import hat, so3_exp, so3_left_jacobian, so3_left_jacobian_inverse, so3_log
+from jawusd.geometry.so3 import hat, nearest_rotation, so3_exp, so3_left_jacobian, so3_left_jacobian_inverse, so3_log
 
 # Angle a [rad] below which the coupling block uses its series: the relative error of the closed form grows like a^-5.
 _COUPLING_SERIES_RAD = 0.3
@@ -140,12 +140,9 @@ def se3_adjoint(T: ArrayLike) -> Array:
 
 
 def orthonormalise(T: ArrayLike) -> Array:
-    """Return the rigid transforms nearest to matrices (..., 4, 4) (SVD of the rotation block, Arun et al. 1987)."""
+    """Return the rigid transforms nearest to matrices (..., 4, 4)."""
     T = np.asarray(T, dtype=np.float64)
-    U, _, Vt = np.linalg.svd(T[..., :3, :3])
-    sign = np.ones((*T.shape[:-2], 3))
-    sign[..., 2] = np.sign(np.linalg.det(U @ Vt))
-    return make_transform((U * sign[..., None, :]) @ Vt, T[..., :3, 3])
+    return make_transform(nearest_rotation(T[..., :3, :3]), T[..., :3, 3])
 
 
 def rigidity_defect(T: ArrayLike) -> Array:

@@ -153,6 +153,14 @@ def so3_left_jacobian_inverse(w: ArrayLike) -> Array:
     return _series(w, -0.5, factor)
 
 
+def nearest_rotation(M: Array) -> Array:
+    """Return the rotations (..., 3, 3) nearest to matrices (..., 3, 3) (Kabsch 1976, Arun et al. 1987)."""
+    U, _, Vt = np.linalg.svd(M)
+    sign = np.ones((*M.shape[:-2], 1, 3))
+    sign[..., 0, 2] = np.sign(np.linalg.det(U @ Vt))
+    return (U * sign) @ Vt
+
+
 def random_rotation(rng: np.random.Generator, shape: tuple[int, ...] = ()) -> Array:
     """Draw rotation matrices (*shape, 3, 3) uniformly (normalised Gaussian quaternions)."""
     return matrix_from_wxyz(rng.normal(size=(*shape, 4)))
