@@ -10,13 +10,12 @@ from pydantic import Field, ValidationError, field_validator, model_validator
 
 from jawusd.base.errors import AnyPath, FormatError, JawusdError, UnitsError
 from jawusd.base.npz import check_format
-from jawusd.formats.capture_keys import Key, KeyEntry, entries, key, problems_of
+from jawusd.formats.capture_keys import FrameNumber, FrameRate, Key, KeyEntry, entries, key, problems_of
 from jawusd.formats.capture_parts import Boards, CameraSource, Scans, resolve_paths, similar_names
 from jawusd.formats.text import Strict, read_toml
 from jawusd.geometry import rigidity_defect
 
 FAMILY, VERSION = "jawusd-capture", 1
-_FrameNumber = Annotated[int, Field(ge=0)]
 _MOST_PICKS = 200  # maximum number of picked vertices per arch; tracking tries all triples of them
 
 
@@ -60,7 +59,7 @@ class Pick(Strict):
     """Picked vertex of a teeth scan, and its pixels in the images of several cameras."""
 
     vertex: Annotated[
-        int, key("Index of a vertex of the scan, from 0 in file order; `jawusd view` writes it.", "0", ge=0)
+        int, key("Index of a vertex of the scan, from 0 in file order; `jawusd view` writes it.", "0"), Field(ge=0)
     ]
     views: Annotated[
         tuple[PickView, ...],
@@ -68,15 +67,15 @@ class Pick(Strict):
             "Where it is seen, in two or more cameras.",
             '[{ camera = "left", x = 651.5, y = 250.4 }, { camera = "right", x = 663.2, y = 290.4 }]',
             "px",
-            min_length=2,
         ),
+        Field(min_length=2),
     ]
 
 
 class Bootstrap(Strict):
     """Picked vertices that initialise tracking, in one frame of the reference camera."""
 
-    frame: Annotated[int, key("Frame of the reference camera in which the points are picked.", "120", ge=0)]
+    frame: Annotated[FrameNumber, key("Frame of the reference camera in which the points are picked.", "120")]
     upper: tuple[Pick, ...] = Field((), max_length=_MOST_PICKS)
     lower: tuple[Pick, ...] = Field((), max_length=_MOST_PICKS)
 
@@ -85,8 +84,8 @@ class MotionSection(Strict):
     """Rest frame: the video frame in which the teeth are in occlusion."""
 
     rest_frame: Annotated[
-        int | None,
-        key("A frame with the teeth together; default: frames in occlusion are found automatically.", "46", ge=0),
+        FrameNumber | None,
+        key("A frame with the teeth together; default: frames in occlusion are found automatically.", "46"),
     ] = None
 
 
@@ -122,23 +121,21 @@ class Capture(Strict):
     folder: Path
     name: Annotated[
         str,
-        key(
-            "Name of the subject or take: letters, digits, spaces, _ - and dots.",
-            '"anna"',
-            min_length=1,
-            pattern=r"^[A-Za-z0-9_\-. ]+$",
-        ),
+        key("Name of the subject or take: letters, digits, spaces, _ - and dots.", '"anna"'),
+        Field(min_length=1, pattern=r"^[A-Za-z0-9_\-. ]+$"),
     ]
-    fps: Annotated[float, key("Frame rate of the clips.", "23.976", "frames per second", gt=0, le=10000)]
+    fps: Annotated[FrameRate, key("Frame rate of the clips.", "23.976", "frames per second")]
     frames: Annotated[
-        tuple[_FrameNumber, _FrameNumber] | None,
+        tuple[FrameNumber, FrameNumber] | None,
         key("First frame, and one past the last, of the reference camera; default: all.", "[30, 270]", "frames"),
     ] = None
     calibration: Annotated[
         Path | None, key("Calibration of the cameras; default: calibrated from [boards].", '"calibration.toml"')
     ] = None
     calibration_unit_mm: Annotated[
-        float, key("Length of the calibration's unit: 1000 if it is in metres.", "1000.0", "mm", gt=0, le=1e6)
+        float,
+        key("Length of the calibration's unit: 1000 if it is in metres.", "1000.0", "mm"),
+        Field(gt=0, le=1e6),
     ] = 1.0
     colour_config: Annotated[
         Path | None, key("OpenColorIO config that defines named colour spaces of the footage.", '"config.ocio"')

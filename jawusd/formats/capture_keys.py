@@ -20,6 +20,8 @@ _ALLOWED_SHOWN = 300  # maximum length of a list of keys in a message [character
 
 T = TypeVar("T")
 Location = tuple[int | str, ...]
+FrameNumber = Annotated[int, Field(ge=0)]
+FrameRate = Annotated[float, Field(gt=0, le=10000)]  # [1/s]
 _UNKNOWN = "extra_forbidden"  # pydantic's error type for unknown keys
 #: Messages by pydantic's error type; names in braces are keys of the error's context.
 _WORDS = {
@@ -55,27 +57,9 @@ class Key:
     unit: str = ""
 
 
-def key(
-    meaning: str,
-    example: str = "",
-    unit: str = "",
-    *,
-    gt: float | None = None,
-    ge: float | None = None,
-    le: float | None = None,
-    min_length: int | None = None,
-    pattern: str | None = None,
-) -> FieldInfo:
-    """Return the annotation of a model field: its documentation (see `Key`) and pydantic's limits."""
-    field: FieldInfo = Field(
-        description=meaning,
-        json_schema_extra={"example": example, "unit": unit},
-        gt=gt,
-        ge=ge,
-        le=le,
-        min_length=min_length,
-        pattern=pattern,
-    )
+def key(meaning: str, example: str = "", unit: str = "") -> FieldInfo:
+    """Return the annotation of a model field with its documentation (see `Key`)."""
+    field: FieldInfo = Field(description=meaning, json_schema_extra={"example": example, "unit": unit})
     return field
 
 

@@ -9,13 +9,17 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Literal, TypeVar, cast
 
-from pydantic import BaseModel, model_validator
+from pydantic import BaseModel, Field, model_validator
 
 from jawusd.base.errors import CaptureError, JawusdError
-from jawusd.formats.capture_keys import Location, key, place
+from jawusd.formats.capture_keys import FrameNumber, FrameRate, Location, key, place
 from jawusd.formats.clips import ClipSource
 from jawusd.formats.file_names import is_pattern, wrong_kind
 from jawusd.formats.text import Strict
+
+_GrayValue = Annotated[int, Field(ge=1, le=65535)]
+_Corners = Annotated[int, Field(ge=3, le=50)]
+_Side = Annotated[float, Field(gt=0, le=200)]
 
 
 class Scans(Strict):
@@ -51,8 +55,8 @@ class Masks(Strict):
         Path, key("Masks of the upper teeth: PNG files numbered as %06d, or a video.", '"masks/left/upper/%06d.png"')
     ]
     lower: Annotated[Path, key("Masks of the lower teeth.", '"masks/left/lower/%06d.png"')]
-    upper_value: Annotated[int | None, key("With `labels`: gray value of the upper teeth.", "1", ge=1, le=65535)] = None
-    lower_value: Annotated[int | None, key("With `labels`: gray value of the lower teeth.", "2", ge=1, le=65535)] = None
+    upper_value: Annotated[_GrayValue | None, key("With `labels`: gray value of the upper teeth.", "1")] = None
+    lower_value: Annotated[_GrayValue | None, key("With `labels`: gray value of the lower teeth.", "2")] = None
 
     @model_validator(mode="before")
     @classmethod
@@ -102,12 +106,8 @@ class CameraSource(Strict):
 
     name: Annotated[
         str,
-        key(
-            "Name of the camera, as in the calibration: letters, digits, _ and -.",
-            '"left"',
-            min_length=1,
-            pattern=r"^[A-Za-z0-9_\-]+$",
-        ),
+        key("Name of the camera, as in the calibration: letters, digits, _ and -.", '"left"'),
+        Field(min_length=1, pattern=r"^[A-Za-z0-9_\-]+$"),
     ]
     video: Annotated[
         Path | None,
@@ -126,18 +126,12 @@ class CameraSource(Strict):
         ),
     ] = ""
     start_frame: Annotated[
-        int | None,
-        key('Number of the first frame for [sync] method = "numbers"; default: from the file name.', "1001", ge=0),
+        FrameNumber | None,
+        key('Number of the first frame for [sync] method = "numbers"; default: from the file name.', "1001"),
     ] = None
     fps: Annotated[
-        float | None,
-        key(
-            "Frame rate of an image sequence; default: that of the capture.",
-            "23.976",
-            "frames per second",
-            gt=0,
-            le=10000,
-        ),
+        FrameRate | None,
+        key("Frame rate of an image sequence; default: that of the capture.", "23.976", "frames per second"),
     ] = None
     colour_space: Annotated[
         str | None,
@@ -156,9 +150,8 @@ class CameraSource(Strict):
             "Pixel aspect ratio, width over height; default: from the file. Used with calibrations of desqueezed "
             "images.",
             "2.0",
-            ge=0.1,
-            le=10,
         ),
+        Field(ge=0.1, le=10),
     ] = None
 
     @model_validator(mode="after")
@@ -183,13 +176,9 @@ class Boards(Strict):
     """
 
     pattern: Annotated[Literal["chessboard", "charuco"], key("Type of board.")] = "chessboard"
-    cols: Annotated[
-        int, key("Inner corners along a row: number of squares less one. 3 to 50.", "9", "corners", ge=3, le=50)
-    ]
-    rows: Annotated[int, key("Inner corners along a column.", "6", "corners", ge=3, le=50)]
-    square_mm: Annotated[
-        float, key("Side of a square, measured on the printed board. Up to 200.", "8.0", "mm", gt=0, le=200)
-    ]
+    cols: Annotated[_Corners, key("Inner corners along a row: number of squares less one. 3 to 50.", "9", "corners")]
+    rows: Annotated[_Corners, key("Inner corners along a column.", "6", "corners")]
+    square_mm: Annotated[_Side, key("Side of a square, measured on the printed board. Up to 200.", "8.0", "mm")]
     videos: Annotated[
         tuple[Path, ...],
         key(
@@ -199,13 +188,10 @@ class Boards(Strict):
     ]
     dictionary: Annotated[
         str | None,
-        key(
-            "ChArUco boards: OpenCV's name of the marker dictionary.",
-            '"DICT_5X5_100"',
-            pattern=r"^DICT_[4-7]X[4-7]_(50|100|250|1000)$",
-        ),
+        key("ChArUco boards: OpenCV's name of the marker dictionary.", '"DICT_5X5_100"'),
+        Field(pattern=r"^DICT_[4-7]X[4-7]_(50|100|250|1000)$"),
     ] = None
-    marker_mm: Annotated[float | None, key("ChArUco boards: side of a marker.", "6.0", "mm", gt=0, le=200)] = None
+    marker_mm: Annotated[_Side | None, key("ChArUco boards: side of a marker.", "6.0", "mm")] = None
 
     @model_validator(mode="after")
     def _describes_markers(self) -> Boards:
