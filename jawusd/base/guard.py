@@ -105,12 +105,9 @@ def _check_address_space() -> None:
 
 
 def limit_process(memory: int, cpu_s: int | None = None) -> None:
-    """Limit this process and its children.
+    """Limit the memory [bytes], 0 for no limit, and the processor time [s] of this process and its children.
 
-    Args:
-        memory: Maximum memory [bytes]; 0 for no limit. Private writable memory counts, but not address space that CUDA,
-            numba and threads only reserve.
-        cpu_s: Maximum processor time [s].
+    Private writable memory counts, but not address space that CUDA, numba and threads only reserve.
     """
     if resource is None:
         return

@@ -98,12 +98,9 @@ class TextTable:
 
 @errors_name_file
 def read_table(path: Path, most_bytes: int, comment: str = "#", short_rows: bool = False) -> TextTable:
-    """Read a text table whose first row names the columns.
+    """Read a table of at most `most_bytes` whose first row names the columns, without lines that begin with `comment`.
 
-    Args:
-        most_bytes: maximum size of the file [bytes].
-        comment: prefix of lines to skip.
-        short_rows: allow rows to end early; the caller checks them with `check_width`.
+    `short_rows` allows rows to end early; the caller checks them with `check_width`.
 
     Raises:
         FormatError: the file is not text or not a table, or a row has more or fewer cells than the header.
@@ -141,11 +138,9 @@ def check_width(table: TextTable, index: int, separator: str = "") -> None:
 
 
 def split_rows(text: str, comment: str = "#", blank_rows: bool = False) -> tuple[list[tuple[int, list[str]]], str]:
-    """Return the rows of a table with their line numbers, and the separator.
+    """Return the rows of a table with their line numbers, without lines that begin with `comment`, and the separator.
 
-    Args:
-        comment: prefix of lines to skip.
-        blank_rows: keep rows of several blank cells, except at the end.
+    `blank_rows` keeps rows of several blank cells, except at the end.
 
     Raises:
         FormatError: quotes do not match.

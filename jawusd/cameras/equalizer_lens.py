@@ -190,10 +190,8 @@ def opencv_of(
 ) -> tuple[Array, Array, Array]:
     """Return K (3, 3), OpenCV's coefficients, and a rotation vector (3,) [rad], applied to points before projection.
 
-    Args:
-        K: the camera's pinhole matrix [px].
-        size: width and height of the camera's image [px].
-        back_mm: width and height of the camera's film back.
+    `K` (3, 3) [px] is the camera's pinhole matrix; `size` [px] and `back_mm` are widths and heights of its image and
+    film back.
 
     Raises:
         CalibrationError: OpenCV's coefficients approximate the lens with a residual above 0.05 px.

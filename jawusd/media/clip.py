@@ -22,13 +22,10 @@ _Item = TypeVar("_Item")
 
 
 def read_backwards(frames: range, read: Callable[[range], Iterable[_Item]], first: int, most: int) -> Iterator[_Item]:
-    """Yield the items of a descending range of frames, which are read forwards in chunks.
+    """Yield the items of a range of frames in steps of -1, read forwards in chunks; `read` returns those of a chunk.
 
-    Args:
-        frames: the range, in steps of -1.
-        read: returns the items of an ascending range, one per frame.
-        first, most: number of frames in the first chunk, and maximum number. Each chunk is twice as long as the one
-            before, since often only a few frames are needed.
+    The first chunk has `first` frames, and each is twice as long as the one before, up to `most`, since often only a
+    few frames are needed.
     """
     start, count = 0, first
     while start < len(frames):

@@ -115,7 +115,7 @@ class VideoMasks:
     Attributes:
         count: number of images.
         timeline: maps frames to images.
-        odd: reasons why images read so far were rejected, by number; rejected images count as not segmented.
+        odd: see `PngMasks`.
     """
 
     def __init__(self, path: Path, size_px: tuple[int, int], labels: LabelValues | None = None) -> None:

@@ -202,9 +202,7 @@ def find_levels(pictures: Iterable[RawImage], lossy: bool, more: Callable[[], It
     The two levels are those that most images have in common. The background is the darker level, unless the lighter
     level covers most of the area and of the border, since teeth are inside the image.
 
-    Args:
-        pictures: images sampled from the whole take.
-        more: returns all other images; called if the samples are empty.
+    `pictures` are sampled from the whole take; `more` returns all other images, and is called if the samples are empty.
 
     Raises:
         NotMasks: most of the non-empty images are not masks, or have more than two levels.

@@ -203,12 +203,10 @@ class CreaseWalk:
         self._weights = self._stepping()
 
     def crowns(self, up: Mask, down: Mask, most_leaving: Array) -> Mask:
-        """Return which vertices are crown, shape (v,).
+        """Return which vertices are crown, shape (v,), given which are crown seeds `up` and gum seeds `down`, (v,).
 
-        Args:
-            up, down: which vertices are crown seeds and gum seeds, shape (v,).
-            most_leaving: maximum rate at which walks leave a part of `up` for the gum, per mm of its outline [1/mm],
-                shape (v,). Parts with a higher rate have no crease around them: they are gum ridges, no seeds.
+        `most_leaving` (v,) is the maximum rate at which walks leave a part of `up` for the gum, per mm of its outline
+        [1/mm]. Parts with a higher rate have no crease around them: they are gum ridges, no seeds.
         """
         share = self._meeting(up, down)
         leaking = self._leaking(share, up, most_leaving)
