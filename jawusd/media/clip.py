@@ -6,8 +6,11 @@ A timeline maps evenly spaced frames to the images of a video, whose presentatio
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import TypeVar
 
@@ -33,6 +36,20 @@ def read_backwards(frames: range, read: Callable[[range], Iterable[_Item]], firs
         while held:
             yield held.pop()
         start, count = start + count, min(2 * count, most)
+
+
+def read_ahead(reads: Iterable[Callable[[], _Item]], threads: int, count: int) -> Iterator[_Item]:
+    """Yield the results of reads in order; threads do up to `count` of them while the caller works."""
+    coming = iter(reads)
+    pool = ThreadPoolExecutor(threads, "jawusd-ahead")
+    try:
+        waiting = deque(pool.submit(read) for read in islice(coming, count))
+        while waiting:
+            result = waiting.popleft()
+            waiting.extend(pool.submit(read) for read in islice(coming, 1))
+            yield result.result()
+    finally:
+        pool.shutdown(cancel_futures=True)
 
 
 class Timeline:

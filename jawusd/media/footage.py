@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import math
 import threading
-from collections import OrderedDict, deque
+from collections import OrderedDict
 from collections.abc import Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from jawusd.base.errors import CaptureError, naming_file
 from jawusd.formats.clips import ClipSource
 from jawusd.formats.file_names import is_pattern, numbered_files
-from jawusd.media.clip import Clip, Timeline, VideoFrame
+from jawusd.media.clip import Clip, Timeline, VideoFrame, read_ahead
 from jawusd.media.pictures import read_header, read_stored
 from jawusd.media.pixels import Colour, Stored, coloured, to_display
 from jawusd.media.video import Video
@@ -87,21 +87,9 @@ class PictureSequence(Clip):
         return pixels if pixels.ndim == 3 else np.repeat(pixels[..., None], 3, axis=2)
 
     def _converted(self, first: int, last: int, colour: Colour, threads: int) -> Iterator[VideoFrame]:
-        if threads == 1 or last - first < 2:
-            for index in range(first, last):
-                yield self._frame(index, colour)
-            return
-        waiting: deque[Future[VideoFrame]] = deque()
-        with ThreadPoolExecutor(max_workers=_AHEAD) as pool:
-            try:
-                for index in range(first, last):
-                    waiting.append(pool.submit(self._frame, index, colour))
-                    if len(waiting) > _AHEAD:
-                        yield waiting.popleft().result()
-                while waiting:
-                    yield waiting.popleft().result()
-            finally:
-                pool.shutdown(wait=False, cancel_futures=True)
+        reads = (partial(self._frame, index, colour) for index in range(first, last))
+        one_by_one = threads == 1 or last - first < 2
+        return (read() for read in reads) if one_by_one else read_ahead(reads, _AHEAD, _AHEAD)
 
     def _frame(self, index: int, colour: Colour) -> VideoFrame:
         stored, white = self._stored(index)

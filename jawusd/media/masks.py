@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import contextlib
-from collections import deque
 from collections.abc import Callable, Generator, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
+from itertools import repeat
 from pathlib import Path
 
 from jawusd.base.errors import AnyPath, CaptureError
 from jawusd.formats.capture import CameraSource
 from jawusd.formats.clips import ClipSource
 from jawusd.formats.file_names import is_pattern, numbered_files
-from jawusd.media.clip import Timeline
+from jawusd.media.clip import Timeline, read_ahead
 from jawusd.media.footage import open_clip
 from jawusd.media.mask_files import LabelValues, OneMask, PngMasks, VideoMasks, load_png
 from jawusd.media.mask_levels import MaskImage, MaskLevels
@@ -81,7 +80,8 @@ class MaskReader:
         self.levels: MaskLevels | None = None if labels else self._source.levels
         self._prepare = prepare
         self._previous: int | None = None
-        self._ahead: _Ahead | None = None
+        self._ahead: Generator[MaskImage | None] | None = None
+        self._next_ahead = 0
 
     def read(self, frame: int) -> MaskImage | None:
         """Return the prepared mask (h, w) of a frame, 255 for tooth, 0 for background; None if nothing is segmented.
@@ -94,14 +94,18 @@ class MaskReader:
             return None
         follows = self._previous is not None and frame == self._previous + 1
         self._previous = frame
-        if self._ahead is not None and self._ahead.next_frame == frame:
-            return self._ahead.take()
-        if not follows:
-            with contextlib.closing(self._results(frame)) as results:
-                return next(results)
-        self.close()
-        self._ahead = _Ahead(self._results(frame), frame)
-        return self._ahead.take()
+        if self._ahead is None or self._next_ahead != frame:
+            if not follows:
+                with contextlib.closing(self._results(frame)) as results:
+                    return next(results)
+            self.close()
+            self._ahead = self._results_ahead(frame)
+        self._next_ahead = frame + 1
+        try:
+            return next(self._ahead)
+        except Exception:
+            self.close()  # the iterator has ended, and no mask will follow
+            raise
 
     @cached_property
     def is_black(self) -> bool:
@@ -139,7 +143,7 @@ class MaskReader:
     def close(self) -> None:
         """Stop decoding in the background; the reader remains usable."""
         if self._ahead is not None:
-            self._ahead.stop()
+            self._ahead.close()
             self._ahead = None
 
     def __enter__(self) -> MaskReader:
@@ -153,6 +157,10 @@ class MaskReader:
             if mask is not None and not mask.any():
                 mask = None
             yield mask if mask is None or self._prepare is None else self._prepare(mask)
+
+    def _results_ahead(self, first: int) -> Generator[MaskImage | None]:
+        with contextlib.closing(self._results(first)) as results:
+            yield from read_ahead(repeat(partial(next, results, None)), 1, _AHEAD)
 
     def _masks(self, first: int) -> Iterator[MaskImage | None]:
         """Yield the mask of every frame from `first` on."""
@@ -259,25 +267,3 @@ def mask_size_px(path: AnyPath) -> tuple[int, int]:
         return Video(path).size_px
     height, width = load_png(next(iter(numbered_files(path).values()))).shape[:2]
     return width, height
-
-
-class _Ahead:
-    """Iterator that runs in a thread, a few items ahead of the reader."""
-
-    def __init__(self, items: Generator[MaskImage | None], first_frame: int) -> None:
-        self.next_frame = first_frame
-        self._items, self._pool = items, ThreadPoolExecutor(1, "jawusd-masks")
-        self._waiting = deque(self._pool.submit(next, items, None) for _ in range(_AHEAD))
-
-    def take(self) -> MaskImage | None:
-        self.next_frame += 1
-        self._waiting.append(self._pool.submit(next, self._items, None))
-        try:
-            return self._waiting.popleft().result()
-        except Exception:
-            self.next_frame = -1  # the iterator has ended, and no item will follow
-            raise
-
-    def stop(self) -> None:
-        self._pool.shutdown(cancel_futures=True)
-        self._items.close()

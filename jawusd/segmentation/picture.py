@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from itertools import repeat
 from typing import TypeAlias
 
 import cv2
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from jawusd.base.arrays import Array, Mask
 from jawusd.geometry import Camera
-from jawusd.media.clip import Clip, read_backwards
+from jawusd.media.clip import Clip, read_ahead, read_backwards
 from jawusd.media.pixels import ColourPicture
 from jawusd.media.working_view import WorkingView, remap
 
@@ -145,10 +145,4 @@ class ColourFootage:
         def read() -> Pictures:
             return {name: next(reader) for name, reader in readers.items()}
 
-        with ThreadPoolExecutor(1) as ahead:  # decodes the next images while the caller works
-            coming = [ahead.submit(read)] if len(frames) else []
-            for k, frame in enumerate(frames):
-                pictures = coming.pop().result()
-                if k + 1 < len(frames):
-                    coming.append(ahead.submit(read))
-                yield frame, pictures
+        return zip(frames, read_ahead(repeat(read, len(frames)), 1, 1), strict=True)

@@ -81,14 +81,14 @@ def test_decoding_runs_ahead_but_not_away(video: Path) -> None:
 
     with MaskReader(video, SIZE, prepare=prepare) as reader:
         assert reader.read(0) == ("MainThread", mask(0).sum())
-        assert reader.read(1) == ("jawusd-masks_0", mask(1).sum())
+        assert reader.read(1) == ("jawusd-ahead_0", mask(1).sum())
         deadline = time.monotonic() + 5
         while len(prepared) < 5 and time.monotonic() < deadline:
             time.sleep(0.01)
         time.sleep(0.1)
         assert 5 <= len(prepared) <= 7  # 0 and 1, and four that wait, of which one is black
         assert [reader.read(k) is None for k in range(2, COUNT)] == [k in BLACK for k in range(2, COUNT)]
-    assert "jawusd-masks_0" not in {thread.name for thread in threading.enumerate()}
+    assert "jawusd-ahead_0" not in {thread.name for thread in threading.enumerate()}
 
 
 @pytest.mark.parametrize("kind", ["pattern", "video"])
@@ -116,7 +116,7 @@ def test_closing_ends_a_thread_that_waits_for_room(video: Path) -> None:
         for first in range(0, 8, 2):
             reader.read(first)
             reader.read(first + 1)
-            (waiting,) = (thread for thread in threading.enumerate() if thread.name == "jawusd-masks_0")
+            (waiting,) = (thread for thread in threading.enumerate() if thread.name == "jawusd-ahead_0")
             time.sleep(0.05)  # until the thread waits for room
             assert waiting.is_alive()
             reader.close()
