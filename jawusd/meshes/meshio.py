@@ -135,6 +135,7 @@ class Winding(NamedTuple):
     """Winding of a mesh's triangles, and whether the mesh is closed."""
 
     closed: bool  # whether every edge is shared by exactly two triangles, in opposite directions
+    consistent: bool  # whether no two triangles share an edge in the same direction, degenerate ones apart
     outward: bool  # whether triangles are counter-clockwise seen from outside; a guess if the mesh is not closed
     volume_mm3: float  # enclosed volume; positive if triangles are wound outward
 
@@ -147,10 +148,13 @@ def winding(mesh: Mesh) -> Winding:
     """
     places, index = welded(mesh.vertices)
     faces = index[mesh.faces]
-    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    there = np.sort(edges[:, 0] * len(places) + edges[:, 1])
-    back = np.sort(edges[:, 1] * len(places) + edges[:, 0])
-    closed = bool((there[1:] != there[:-1]).all() and (there == back).all())
+    ends = np.roll(faces, -1, axis=1)
+    edges = faces * len(places) + ends
+    there, back = np.sort(edges, axis=None), np.sort(ends * len(places) + faces, axis=None)
+    distinct = bool((there[1:] != there[:-1]).all())
+    closed = distinct and bool((there == back).all())
+    proper = edges[(faces != ends).all(axis=1)]
+    consistent = distinct or len(np.unique(proper)) == proper.size
     a, b, c = np.moveaxis(mesh.vertices[mesh.faces] - mesh.vertices.mean(axis=0), 1, 0)
     volume = float(np.einsum("fi,fi->", a, np.cross(b, c)) / 6)
-    return Winding(closed, volume > 0, volume)
+    return Winding(closed, consistent, volume > 0, volume)

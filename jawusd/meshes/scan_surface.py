@@ -57,18 +57,12 @@ class ScanSurface:
             number = np.cumsum(used) - 1
             number[~used] = cKDTree(vertices[used]).query(vertices[~used])[1]
             vertices, index, faces = vertices[used], number[index], number[faces]
-        n = len(vertices)
         kept = np.sort(np.unique(welded(np.sort(faces, axis=1))[1], return_index=True)[1])
-        links = coo_array(
-            (np.ones(3 * len(kept), np.int8), (faces[kept].ravel(), np.roll(faces[kept], 1, axis=1).ravel())),
-            shape=(n, n),
-        )
-        piece = connected_components(links, directed=False)[1]
         return cls(
             vertices=vertices,
             faces=faces[kept],
             of_vertex=index,
-            piece=piece.astype(np.int64),
+            piece=components(faces[kept], len(vertices)),
             merged=merged,
             empty=int(len(solid) - solid.sum()),
             repeated=len(faces) - len(kept),
@@ -161,6 +155,13 @@ class ScanSurface:
         fold = np.zeros(n)
         np.maximum.at(fold, pairs[first].ravel(), np.repeat(angle, 2))
         return fold
+
+
+def components(faces: NDArray[np.int64] | NDArray[np.int32], count: int) -> Indices:
+    """Return the index of the connected component of each of `count` vertices, (count,), of faces or edges (F, k)."""
+    ends = faces.ravel(), np.roll(faces, 1, axis=1).ravel()
+    links = coo_array((np.ones(faces.size, np.int8), ends), shape=(count, count))
+    return connected_components(links, directed=False)[1].astype(np.int64)
 
 
 def averaging(edges: Indices, count: int) -> csr_array:
@@ -289,8 +290,7 @@ class CreaseWalk:
 def parts(edges: Indices, chosen: Mask) -> Indices:
     """Return the index of the connected part of each chosen vertex, from 0, and -1 for other vertices, shape (v,)."""
     inside = edges[chosen[edges].all(axis=1)]
-    links = coo_array((np.ones(len(inside), np.int8), (inside[:, 0], inside[:, 1])), shape=(len(chosen),) * 2)
-    part = connected_components(links, directed=False)[1]
+    part = components(inside, len(chosen))
     out = np.full(len(chosen), -1, np.int64)
     out[chosen] = np.unique(part[chosen], return_inverse=True)[1].reshape(-1)
     return out

@@ -65,23 +65,15 @@ def paper_scan(mesh: Mesh, name: str) -> PaperScan:
             f"{name} teeth scan: no boundary of interest, which the paper's energy needs (eq. 9)",
             hint="Paint the incisal edges of the front teeth green in the scan, or track with --solver contour.",
         )
+    wound = winding(mesh)
     return PaperScan(
         vertices=np.asarray(mesh.vertices, np.float64),
         plain_faces=np.ascontiguousarray(mesh.faces[teeth & ~boundary], np.int32),
         boundary_faces=np.ascontiguousarray(mesh.faces[boundary], np.int32),
         # Back faces of a solid are hidden by front faces, provided that all faces are wound consistently.
-        cull=winding(mesh).outward and _is_consistent(mesh),
+        cull=wound.outward and wound.consistent,
         centre=mesh.vertices[np.unique(mesh.faces[teeth])].mean(0),
     )
-
-
-def _is_consistent(mesh: Mesh) -> bool:
-    """Return whether all faces are wound consistently: no two faces share an edge in the same direction."""
-    unique, index = np.unique(mesh.vertices, axis=0, return_inverse=True)
-    faces = index.reshape(-1)[mesh.faces]
-    faces = faces[(faces != np.roll(faces, 1, axis=1)).all(1)]
-    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    return len(np.unique(edges[:, 0] * len(unique) + edges[:, 1])) == len(edges)
 
 
 class PaperEnergy:

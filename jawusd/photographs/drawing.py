@@ -8,13 +8,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, label, sum_labels
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from jawusd.base.arrays import Array
 from jawusd.base.errors import TrackingError
 from jawusd.geometry import transform_points
 from jawusd.meshes.raster import draw_depth_labels, project
+from jawusd.meshes.scan_surface import components
 from jawusd.tracking.contour.scan import Faces, Scan
 
 _WIDTH_PX = 1.8  # standard deviation of the Gaussian blur, with which lines a few pixels wide form a single ridge
@@ -131,9 +130,7 @@ def split_teeth(scan: Scan, T_anatomical_scan: Array, arch: int) -> Crowns:
     In place of missing gum, faces along the middle of the arch hide the teeth behind them.
     """
     faces = scan.crown_faces
-    pairs = (faces.ravel(), np.roll(faces, 1, axis=1).ravel())
-    links = coo_array((np.ones(faces.size), pairs), [len(scan.vertices)] * 2)
-    piece = connected_components(links, directed=False)[1][faces[:, 0]]
+    piece = components(faces, len(scan.vertices))[faces[:, 0]]
     numbers, count = np.unique(piece, return_counts=True)
     large = numbers[count >= _FEWEST_FACES][:_MOST_TEETH]
     to_gum = T_anatomical_scan[1, :3] * (1.0 if arch == 0 else -1.0)

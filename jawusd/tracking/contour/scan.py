@@ -7,8 +7,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from jawusd.base.arrays import Array
 from jawusd.base.errors import TrackingError
@@ -17,6 +15,7 @@ from jawusd.geometry import transform_point
 from jawusd.geometry.points import welded
 from jawusd.meshes.raster import draw_depth_labels, draw_silhouette, project, words_for
 from jawusd.meshes.remeshing import decimated_scan
+from jawusd.meshes.scan_surface import components
 from jawusd.tracking.contour.gingival_margin import crown_gum_segments
 
 #: Vertex indices of faces, or other index tables for compiled code.
@@ -171,10 +170,7 @@ def _with_tables(name: str, vertices: Array, crown_faces: Faces, gum_faces: Face
 
 def _wound_outwards(vertices: Array, faces: Faces) -> Faces:
     """Return the faces, with connected components of negative volume, about their own centres, flipped."""
-    links = coo_array(
-        (np.ones(3 * len(faces)), (faces.ravel(), np.roll(faces, 1, axis=1).ravel())), [len(vertices)] * 2
-    )
-    piece = connected_components(links, directed=False)[1][faces[:, 0]]
+    piece = components(faces, len(vertices))[faces[:, 0]]
     corners = vertices[faces]
     count = np.bincount(piece)
     middle = corners.mean(1)
