@@ -22,22 +22,16 @@ VIDEOS = (".mp4", ".mov", ".mkv", ".avi", ".webm", ".m4v", ".mxf", ".mts", ".mpg
 PICTURES = (".png", ".tif", ".tiff", ".exr", ".dpx", ".jpg", ".jpeg")
 MESHES = (".ply", ".stl", ".obj", ".dcm")
 
-# File types that are not accepted by a group of keys in capture.toml, with their suffixes.
-_WRONG = {
-    "scans": (("a video", VIDEOS), ("a picture", PICTURES)),
-    "footage": (("a mesh", MESHES), ("a calibration", (".toml", ".json", ".xml", ".csv", ".yml", ".yaml"))),
-    "calibration": (("a mesh", MESHES), ("a video", VIDEOS), ("a picture", PICTURES)),
-}
-_NEEDED = {
-    "scans": "a mesh is needed (.ply, .stl, .obj or .dcm)",
-    "footage": "a video or an image sequence is needed",
-    "calibration": "a calibration is needed; clips of a board belong in [boards] videos",
-}
-_GROUPS = {
-    **dict.fromkeys(("upper_teeth", "lower_teeth", "mandible", "skull"), "scans"),
-    **dict.fromkeys(("video", "videos", "upper", "lower"), "footage"),
-    "calibration": "calibration",
-}
+_VIDEO, _PICTURE, _MESH = ("a video", VIDEOS), ("a picture", PICTURES), ("a mesh", MESHES)
+_CALIBRATION = ("a calibration", (".toml", ".json", ".xml", ".csv", ".yml", ".yaml"))
+# Keys in capture.toml, the files that they need, and file types that are not accepted, with their suffixes.
+_KEYS = (
+    (("upper_teeth", "lower_teeth", "mandible", "skull"), "a mesh is needed (.ply, .stl, .obj or .dcm)",
+     (_VIDEO, _PICTURE)),
+    (("video", "videos", "upper", "lower"), "a video or an image sequence is needed", (_MESH, _CALIBRATION)),
+    (("calibration",), "a calibration is needed; clips of a board belong in [boards] videos",
+     (_MESH, _VIDEO, _PICTURE)),
+)  # fmt: skip
 
 
 def is_pattern(path: Path) -> bool:
@@ -138,8 +132,8 @@ def _offer(folder: Path) -> str:
 
 def wrong_kind(key: str, path: PurePath) -> str | None:
     """Return why a key in capture.toml, such as `video`, rejects the suffix of a file, and what it accepts, or None."""
-    group = _GROUPS.get(key, "")
-    for kind, suffixes in _WRONG.get(group, ()):
-        if path.suffix.lower() in suffixes:
-            return f"is {kind}; {_NEEDED[group]}."
+    for keys, needed, wrong in _KEYS:
+        for kind, suffixes in wrong if key in keys else ():
+            if path.suffix.lower() in suffixes:
+                return f"is {kind}; {needed}."
     return None
