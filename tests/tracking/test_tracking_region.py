@@ -11,10 +11,9 @@ from jawusd.tracking.contour.scan import CROWN
 from jawusd.tracking.contour.views import Drawn
 from jawusd.tracking.region.appearance import Picture
 from jawusd.tracking.region.colours import BINS, PATCHES, TABLES, Areas, CameraColours, colour_bins
-from jawusd.tracking.region.creases import search_creases
 from jawusd.tracking.region.edges import _light, search_borders, sharpen
 from jawusd.tracking.region.search import fraction_in_sight
-from jawusd.tracking.region.view import Counts, RegionView, measure_in_sight
+from jawusd.tracking.region.view import Counts, RegionView, measure_in_sight, search_creases
 
 TOOTH, LIP = np.array([215.0, 205.0, 185.0]), np.array([150.0, 75.0, 80.0])
 SIZE, MIDDLE, RADIUS = 120, 60.3, 30.4

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from jawusd.tracking.config import SmoothErrors
-from jawusd.tracking.contour.smooth_errors import without_smooth_errors
+from jawusd.tracking.contour.correspondences import without_smooth_errors
 
 
 def drawn(seed, count=120):

@@ -1,4 +1,4 @@
-"""Match contour samples with mask edges along their normals, and accumulate the normal equations."""
+"""Match contour samples with mask edges, eliminate smooth errors, and accumulate the normal equations."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jawusd.base.arrays import Array
+from jawusd.tracking.config import SmoothErrors
 from jawusd.tracking.contour.equations import OutlineSums
 from jawusd.tracking.contour.samples import (
     COLUMNS,
@@ -22,7 +23,8 @@ from jawusd.tracking.contour.samples import (
     X,
     Y,
     Z,
-    pixel_of,
+    is_nearer,
+    value_at,
 )
 
 _GUM, _DISTANCE, _TERMS = 7, 9, 10  # columns of `LinearTerms.rows`, and their number
@@ -41,15 +43,6 @@ def _sample(mask: NDArray[np.uint8], x: float, y: float) -> float:
     return (mask[j, i] * (1 - a) + mask[j, i + 1] * a) * (1 - b) + (
         mask[j + 1, i] * (1 - a) + mask[j + 1, i + 1] * a
     ) * b
-
-
-@numba.njit(nogil=True, cache=True, inline="always")
-def _at(picture: NDArray[np.float32], x: float, y: float) -> float:
-    i = pixel_of(x)
-    j = pixel_of(y)
-    if i < 0 or j < 0 or j >= picture.shape[0] or i >= picture.shape[1]:
-        return 0.0
-    return picture[j, i]
 
 
 @numba.njit(nogil=True, cache=True)
@@ -102,7 +95,7 @@ def search_edges(
         sample = samples[s]
         x, y, nx, ny, own = sample[U], sample[V], sample[NX], sample[NY], sample[INVERSE_DEPTH]
         out[s] = np.nan
-        if _at(other_inverse_depth, x, y) * (1 - tolerance_mm * own) > own:
+        if is_nearer(value_at(other_inverse_depth, x, y), own, tolerance_mm):
             continue  # the other arch is in front of the sample
         d = _nearest_edge(mask, x, y, nx, ny, reach_px)
         if np.isfinite(d):
@@ -113,8 +106,8 @@ def search_edges(
             if -(gx * nx + gy * ny) < cos_limit * np.sqrt(gx * gx + gy * gy):
                 continue  # a mask edge that crosses the contour belongs to a lip or a neighbouring tooth
             if _sample(other_mask, ex + 2 * nx, ey + 2 * ny) > _EDGE:
-                other = _at(other_inverse_depth, ex + 2 * nx, ey + 2 * ny)
-                if other == 0.0 or other * (1 - 0.25 * tolerance_mm * own) > own:
+                other = value_at(other_inverse_depth, ex + 2 * nx, ey + 2 * ny)
+                if other == 0.0 or is_nearer(other, own, 0.25 * tolerance_mm):
                     continue  # the edge belongs to the other arch, which is in front
         out[s] = d
 
@@ -200,6 +193,60 @@ def linear_terms(
         rows[n, _DISTANCE] = d
         n += 1
     return LinearTerms(rows[:n], weights[:n], pixels[:n])
+
+
+@numba.njit(nogil=True, cache=True)
+def without_smooth_errors(rows: Array, weights: Array, pixels: Array, smooth: SmoothErrors) -> Array:
+    """Return the rows of samples minus their weighted least-squares fit by a smooth field, times the noise ratio.
+
+    Errors of drawn outlines and of colour edges change little over a few millimetres. Least squares treats samples as
+    independent, and gives such errors too much weight where the contour is long. Here, the error is a smooth field,
+    interpolated bilinearly between nodes on a grid, plus white noise. The nodes have a normal prior, and are eliminated
+    from the normal equations (generalised least squares; Aitken 1936). What remains are differences over less than the
+    node spacing, such as the two sides of a gap between teeth, in which smooth errors cancel.
+
+    For rows X, weights W, interpolation weights B, prior precision p and noise ratio g, the result is
+    g (X - B (B^T W B + p)^-1 B^T W X); its product with W X is the matrix of generalised normal equations.
+
+    Args:
+        rows: linear terms of every sample, shape (n, m).
+        weights: weight of every sample [px], shape (n,).
+        pixels: position of every sample in the image [px], shape (n, 2), not negative.
+        smooth: model of the errors.
+    """
+    count, terms = rows.shape
+    columns = int(pixels[:, 0].max() / smooth.spacing_px) + 2 if count else 0
+    lines = int(pixels[:, 1].max() / smooth.spacing_px) + 2 if count else 0
+    number = np.full(columns * lines, -1)  # index of every grid node among those that are used
+    nodes, shares, used = np.empty((count, 4), np.int64), np.empty((count, 4)), 0
+    for s in range(count):
+        x, y = pixels[s, 0] / smooth.spacing_px, pixels[s, 1] / smooth.spacing_px
+        i, j = int(x), int(y)
+        for k in range(4):
+            right, down = k % 2, k // 2
+            place = (j + down) * columns + i + right
+            if number[place] < 0:
+                number[place] = used
+                used += 1
+            nodes[s, k] = number[place]
+            shares[s, k] = abs(1 - right - (x - i)) * abs(1 - down - (y - j))
+    normal, right_sides = np.zeros((used, used)), np.zeros((used, terms))
+    for s in range(count):
+        for k in range(4):
+            share = weights[s] * shares[s, k]
+            for q in range(4):
+                normal[nodes[s, k], nodes[s, q]] += share * shares[s, q]
+            for t in range(terms):
+                right_sides[nodes[s, k], t] += share * rows[s, t]
+    for k in range(used):
+        normal[k, k] += smooth.prior_px
+    field = np.linalg.solve(normal, right_sides)
+    out = smooth.noise_ratio * rows
+    for s in range(count):
+        for k in range(4):
+            for t in range(terms):
+                out[s, t] -= smooth.noise_ratio * shares[s, k] * field[nodes[s, k], t]
+    return out
 
 
 @numba.njit(nogil=True, cache=True)

@@ -52,36 +52,14 @@ def contour_samples(
             otherwise hides the point.
         towards_gum: for scans without gum, unit vector (3,) in scan coordinates: outlines facing this way are gum line.
     """
-    gum = np.zeros(3) if towards_gum is None else towards_gum
-    tables = (scan.vertices, scan.crown_faces, scan.planes, scan.edges, scan.gingival_margin, scan.margin_directions)
-    where = (scan.centre, eye, matrix, labels, inverse_depth)
-    samples, count = _samples(*tables, *where, step_px, depth_tolerance_mm, gum)
-    return samples, count
-
-
-@numba.njit(nogil=True, cache=True)
-def _samples(
-    vertices: Array,
-    faces: Faces,
-    planes: Array,
-    edges: Faces,
-    margin: Array,
-    margin_directions: Array,
-    centre: Array,
-    eye: Array,
-    matrix: Array,
-    labels: NDArray[np.uint8],
-    inverse_depth: NDArray[np.float32],
-    step_px: float,
-    tolerance_mm: float,
-    towards_gum: Array,
-) -> tuple[Array, int]:
-    """Implement `contour_samples` on the tables of a scan."""
-    px_per_mm = _px_per_mm(matrix, centre)
-    candidates = _silhouette(vertices, faces, planes, edges, eye, matrix, step_px, labels.shape)
-    facing = _in_picture(matrix, towards_gum)
-    silhouette = _outermost(_visible(candidates, labels, inverse_depth, tolerance_mm, px_per_mm, facing), labels.shape)
-    line = _gingival_margin(margin, margin_directions, matrix, labels, inverse_depth, tolerance_mm)
+    candidates = _silhouette(
+        scan.vertices, scan.crown_faces, scan.planes, scan.edges, eye, matrix, step_px, labels.shape
+    )
+    facing = _in_picture(matrix, np.zeros(3) if towards_gum is None else towards_gum)
+    px_per_mm = _px_per_mm(matrix, scan.centre)
+    visible = _visible(candidates, labels, inverse_depth, depth_tolerance_mm, px_per_mm, facing)
+    silhouette, margin = _outermost(visible, labels.shape), (scan.gingival_margin, scan.margin_directions)
+    line = _gingival_margin(*margin, matrix, labels, inverse_depth, depth_tolerance_mm)
     return np.concatenate((silhouette, line)), len(silhouette)
 
 
@@ -205,6 +183,22 @@ def pixel_of(coordinate: float) -> int:
     return int(np.floor(coordinate + 0.5))
 
 
+@numba.njit(nogil=True, cache=True, inline="always")
+def value_at(picture: NDArray[np.float32] | NDArray[np.uint8], x: float, y: float) -> float:
+    """Return the value of the pixel that contains an image position [px]; 0 outside the image."""
+    i = pixel_of(x)
+    j = pixel_of(y)
+    if i < 0 or j < 0 or j >= picture.shape[0] or i >= picture.shape[1]:
+        return 0
+    return picture[j, i]
+
+
+@numba.njit(nogil=True, cache=True, inline="always")
+def is_nearer(seen: float, own: float, tolerance_mm: float) -> bool:
+    """Return whether a rendered surface is in front of a sample by more than the tolerance; depths are inverse."""
+    return seen * (1.0 - tolerance_mm * own) > own
+
+
 @numba.njit(nogil=True, cache=True)
 def _visible(
     samples: Array,
@@ -229,7 +223,7 @@ def _visible(
             continue
         if labels[b, a] == CROWN or labels[j, i] != CROWN:
             continue
-        if _nearer(inverse_depth[j, i], sample[INVERSE_DEPTH], tolerance_mm):
+        if is_nearer(inverse_depth[j, i], sample[INVERSE_DEPTH], tolerance_mm):
             continue
         out[n] = sample
         if out[n, GUM_SHARE] == 0.0:
@@ -283,12 +277,6 @@ def _has_one_outside(samples: Array, s: int, last: NDArray[np.int32], before: ND
                     return True
                 k = before[k]
     return False
-
-
-@numba.njit(nogil=True, cache=True, inline="always")
-def _nearer(seen: float, own: float, tolerance_mm: float) -> bool:
-    """Return whether a rendered surface is in front of a sample by more than the tolerance; depths are inverse."""
-    return seen * (1.0 - tolerance_mm * own) > own
 
 
 @numba.njit(nogil=True, cache=True, inline="always")
@@ -352,9 +340,9 @@ def _gingival_margin(
             ny = -ny
         elif first != GUM or second != CROWN:
             continue
-        if _nearer(inverse_depth[pixel_of(v - ny), pixel_of(u - nx)], 1.0 / w, tolerance_mm):
+        if is_nearer(inverse_depth[pixel_of(v - ny), pixel_of(u - nx)], 1.0 / w, tolerance_mm):
             continue
-        if _nearer(inverse_depth[pixel_of(v + ny), pixel_of(u + nx)], 1.0 / w, tolerance_mm):
+        if is_nearer(inverse_depth[pixel_of(v + ny), pixel_of(u + nx)], 1.0 / w, tolerance_mm):
             continue
         out[n, X], out[n, Y], out[n, Z], out[n, U], out[n, V] = x, y, z, u, v
         out[n, NX], out[n, NY], out[n, LENGTH], out[n, INVERSE_DEPTH] = nx / reach, ny / reach, length, 1.0 / w

@@ -15,7 +15,13 @@ import numpy as np
 from jawusd.base.arrays import Array, Mask
 from jawusd.geometry import bite_normal, orthonormalise, transform_point
 from jawusd.tracking.config import Item, Mapper, Result, SmoothErrors, TrackingConfig
-from jawusd.tracking.contour.correspondences import accumulate, linear_terms, scatter_of_tiles, search_edges
+from jawusd.tracking.contour.correspondences import (
+    accumulate,
+    linear_terms,
+    scatter_of_tiles,
+    search_edges,
+    without_smooth_errors,
+)
 from jawusd.tracking.contour.equations import (
     NormalEquations,
     OutlineSums,
@@ -28,7 +34,6 @@ from jawusd.tracking.contour.equations import (
 from jawusd.tracking.contour.rendering import Contour, Drawings, Rendering
 from jawusd.tracking.contour.samples import HABITS, LENGTH
 from jawusd.tracking.contour.scan import ARCHES, Scan, thinned
-from jawusd.tracking.contour.smooth_errors import without_smooth_errors
 from jawusd.tracking.contour.views import Drawn, View, present_masks
 
 _ROUGH_FACES = 6_000  # number of crown faces of an arch in short trials: a third of that of a decimated scan

@@ -11,8 +11,8 @@ import numpy as np
 
 from jawusd.base.arrays import Array
 from jawusd.geometry import transform_points
+from jawusd.tracking.contour.correspondences import without_smooth_errors
 from jawusd.tracking.contour.samples import HABITS, LENGTH, NX, NY, U, V, X, Z
-from jawusd.tracking.contour.smooth_errors import without_smooth_errors
 from jawusd.tracking.contour.solver import Matched
 from jawusd.tracking.contour.views import View
 from jawusd.tracking.initialization.magnification import displacement_slopes, principal_point

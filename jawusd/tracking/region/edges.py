@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jawusd.base.arrays import Array
-from jawusd.tracking.contour.samples import INVERSE_DEPTH, NX, NY, U, V, pixel_of
+from jawusd.tracking.contour.samples import INVERSE_DEPTH, NX, NY, U, V, is_nearer, pixel_of, value_at
 from jawusd.tracking.contour.scan import CROWN
 
 _MOST_STEPS = 10  # maximum number of search steps to either side of a sample
@@ -87,7 +87,7 @@ def search_borders(
         clearness[s] = 0.0
         sample = samples[s]
         x, y, nx, ny = sample[U], sample[V], sample[NX], sample[NY]
-        if _hidden(sample, other_inverse_depth, tolerance_mm):
+        if is_nearer(value_at(other_inverse_depth, x, y), sample[INVERSE_DEPTH], tolerance_mm):
             clearness[s] = np.nan
             continue
         table = ratio[tables[s]]
@@ -106,16 +106,6 @@ def search_borders(
             continue  # a border that crosses the contour belongs to a lip or a neighbouring tooth
         out[s] = d
         clearness[s] = min(1.0, clear)
-
-
-@numba.njit(nogil=True, cache=True, inline="always")
-def _hidden(sample: Array, other_inverse_depth: NDArray[np.float32], tolerance_mm: float) -> bool:
-    """Return whether the other arch lies in front of a sample."""
-    i, j = pixel_of(sample[U]), pixel_of(sample[V])
-    if i < 0 or j < 0 or j >= other_inverse_depth.shape[0] or i >= other_inverse_depth.shape[1]:
-        return False
-    own = sample[INVERSE_DEPTH]
-    return other_inverse_depth[j, i] * (1 - tolerance_mm * own) > own
 
 
 @numba.njit(nogil=True, cache=True, inline="always")
@@ -264,7 +254,7 @@ def sharpen(
                 value = colour[c] / 255 if power == 1.0 else _light(colour[c])
                 p += (value - outer[c]) * (inner[c] - outer[c])
             line[q] = p / norm
-        place = _steepest(line, steps, arm)
+        place = steepest(line, arm, arm + 2 * steps, arm, True, arm + steps)
         if np.isnan(place):
             clearness[s] *= 0.3
         else:
@@ -272,24 +262,26 @@ def sharpen(
 
 
 @numba.njit(nogil=True, cache=True, inline="always")
-def _steepest(line: Array, steps: int, arm: int) -> float:
-    """Return the position of the steepest descent of a profile [samples from its middle]; NaN without local maximum.
+def steepest(line: Array, first: int, last: int, arm: int, falls: bool, origin: int) -> float:
+    """Return the interpolated index of the steepest change of a profile minus `origin`; NaN without a local maximum.
 
     Args:
-        line: profile of 2 (steps + arm) + 1 samples.
-        steps: search steps to either side.
+        first, last: range of indices that are searched.
         arm: number of samples on either side from whose linearly weighted difference the gradient is computed.
+        falls: whether only descents count.
     """
     before, slope = np.nan, np.nan
     best, place = 0.0, np.nan
-    for k in range(2 * steps + 1):
+    for k in range(first, last + 1):
         after = 0.0
         for i in range(1, arm + 1):
-            after += (line[k + arm - i] - line[k + arm + i]) * min(i, arm + 1 - i)
-        if k > 1 and slope > best and slope >= before and slope >= after:
+            after += (line[k - i] - line[k + i]) * min(i, arm + 1 - i)
+        if not falls:
+            after = abs(after)
+        if k > first + 1 and slope > best and slope >= before and slope >= after:
             best = slope
             bend = before - 2 * slope + after
-            place = k - 1 - steps + (0.5 * (before - after) / bend if bend < 0 else 0.0)
+            place = k - 1 - origin + (0.5 * (before - after) / bend if bend < 0 else 0.0)
         before, slope = slope, after
     return place
 

@@ -12,12 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jawusd.base.arrays import Array
-from jawusd.tracking.contour.samples import LENGTH, NX, NY, U, V, X, Y, Z, pixel_of
-from jawusd.tracking.contour.scan import GUM
+from jawusd.tracking.contour.samples import LENGTH, NX, NY, U, V, X, Y, Z, pixel, pixel_of, value_at
+from jawusd.tracking.contour.scan import CROWN, GUM
 from jawusd.tracking.contour.views import Drawn
 from jawusd.tracking.region.colours import BINS, KINDS, TABLES
-from jawusd.tracking.region.creases import search_creases
-from jawusd.tracking.region.edges import count_colours, search_borders, sharpen
+from jawusd.tracking.region.edges import colour_at, count_colours, search_borders, sharpen, steepest
 
 _AHEAD_PX = 2.0  # distance outside a crown's silhouette at which the rendered label is tested for gum [px]
 
@@ -36,6 +35,9 @@ _CONTRAST, _SHARP_REACH_PX = 20.0, 2.0  # minimum contrast of refined borders [8
 # A contour is in sight where the mean log ratio at these distances inside it [px] exceeds this value [-].
 _INNER_PX, _TOOTH_RATIO = (1.5, 2.5, 3.5, 4.5), 0.3
 _CREASE_CONTRAST, _CREASE_WEIGHT, _CREASE_REACH_PX = 25.0, 0.5, 7.0
+# Search range of dark lines around a sample, and of edges around a dark line [px]; number of half-pixel steps to either
+# side from which a gradient is computed.
+_CREASE_PX, _BESIDE_PX, _CREASE_ARM = 6.0, 3.0, 3
 
 
 @numba.njit(nogil=True, cache=True)
@@ -81,10 +83,7 @@ def measure_blur(samples: Array, before: Array, shutter: float, out: Array) -> N
     """
     for s in range(len(samples)):
         sample = samples[s]
-        x, y, z = sample[X], sample[Y], sample[Z]
-        w = before[2, 0] * x + before[2, 1] * y + before[2, 2] * z + before[2, 3]
-        u = (before[0, 0] * x + before[0, 1] * y + before[0, 2] * z + before[0, 3]) / w
-        v = (before[1, 0] * x + before[1, 1] * y + before[1, 2] * z + before[1, 3]) / w
+        u, v, _ = pixel(before, sample[X], sample[Y], sample[Z])
         out[s] = shutter * abs((sample[U] - u) * sample[NX] + (sample[V] - v) * sample[NY])
 
 
@@ -113,6 +112,59 @@ def measure_in_sight(
         if total > _TOOTH_RATIO * count:
             length += sample[LENGTH]
     return length
+
+
+@numba.njit(nogil=True, cache=True)
+def search_creases(
+    samples: Array,
+    rgb: NDArray[np.uint8],
+    own_labels: NDArray[np.uint8],
+    other_labels: NDArray[np.uint8],
+    reach_px: float,
+    contrast: float,
+    weight: float,
+    out: Array,
+    clearness: Array,
+) -> None:
+    """Find crown edges in front of the other arch: the steepest brightness change beside the dark line between crowns.
+
+    Both crowns have the same colours. Shading may darken both towards the line, but gradually; the edge is sharp except
+    for lens blur.
+
+    Args:
+        contrast: minimum difference between the brighter tooth and the line [8-bit steps].
+        weight: weight of the edges found [-].
+        Other arguments are those of `edges.search_borders`; only samples without a border are processed.
+    """
+    reach = min(reach_px, _CREASE_PX)
+    n = 2 * int(reach + _BESIDE_PX) + _CREASE_ARM
+    line = np.empty(2 * n + 1)
+    for s in range(len(samples)):
+        sample = samples[s]
+        if clearness[s] != 0.0:  # a border was found, or the sample is hidden
+            continue
+        u, v, nx, ny = sample[U], sample[V], sample[NX], sample[NY]
+        beyond_x, beyond_y = u + 3 * nx, v + 3 * ny
+        if value_at(other_labels, beyond_x, beyond_y) != CROWN or value_at(own_labels, beyond_x, beyond_y) == CROWN:
+            continue
+        for k in range(2 * n + 1):
+            t = 0.5 * (k - n)
+            red, green, blue = colour_at(rgb, u + t * nx, v + t * ny)
+            line[k] = (red + green + blue) / 3
+        low, at = np.inf, n
+        for k in range(n - int(2 * reach), n + int(2 * reach) + 1):
+            p = line[k] + 0.25 * abs(k - n)  # prefer the nearer of two dark lines
+            if p < low:
+                low, at = p, k
+        least = line[at]
+        before, behind = line[max(at - 8, 0)], line[min(at + 8, 2 * n)]
+        if max(before, behind) - least < contrast or min(before, behind) - least < 0.4 * contrast:
+            continue
+        first, last = max(at - int(2 * _BESIDE_PX), _CREASE_ARM), min(at + int(2 * _BESIDE_PX), 2 * n - _CREASE_ARM)
+        place = steepest(line, first, last, _CREASE_ARM, False, 0)
+        if not np.isnan(place) and abs(place - n) <= 2 * reach:
+            out[s] = 0.5 * (place - n)
+            clearness[s] = weight
 
 
 @dataclass(frozen=True, eq=False)
