@@ -29,7 +29,7 @@ from jawusd.pipeline.workspace import open_capture
 from jawusd.segmentation.picture import Pictures
 from jawusd.tracking.contour.scan import teeth_centre
 from jawusd.tracking.performance.coordinates import Pose
-from jawusd.tracking.region.live import LiveTake
+from jawusd.tracking.region.performance import LiveTake
 
 _PATIENCE_S = 2.0  # time without visible teeth [s] after which a new search begins
 _WAIT_S = 0.25

@@ -131,7 +131,7 @@ def first_pass(
     from jawusd.pipeline.segment_guide import combine_guide
     from jawusd.pipeline.videos import track_videos
     from jawusd.tracking import track_capture
-    from jawusd.tracking.region.condyle_fusion import widen_strained
+    from jawusd.tracking.region.jaw_priors import widen_strained
 
     with naming_file(capture.file):
         cameras, (meshes, findings) = load_cameras(capture), load_labelled(capture)
@@ -166,8 +166,7 @@ def model_pass(
 
     Captures without masks are not tracked again; their poses are combined with the model. For errors, see `track`.
     """
-    from jawusd.tracking.sequence.kinematic_prior import weigh_with_model
-    from jawusd.tracking.sequence.model_refinement import refine_tracks
+    from jawusd.tracking.sequence.model_refinement import refine_tracks, weigh_with_model
 
     jaw = JawRig(model.arrays, model.meta)
     if not any(camera.masks for camera in capture.cameras):

@@ -43,8 +43,8 @@ from jawusd.geometry import transform_points  # noqa: E402
 from jawusd.tracking.performance import motion  # noqa: E402
 from jawusd.tracking.performance.attempts import LARGEST_SIGMA  # noqa: E402
 from jawusd.tracking.performance.skin import SLOW, SkinFactor, SkinFilter  # noqa: E402
+from jawusd.tracking.performance.smoother import VARIANCE_RATIO  # noqa: E402
 from jawusd.tracking.performance.system import TakeSystem  # noqa: E402
-from jawusd.tracking.region import live  # noqa: E402
 
 UNTRAINED = 4
 FPS, PERIOD, PARTED, SEEN, SIGMA_MM = 24.0, 48, 9, (3, 6), 0.15
@@ -123,7 +123,7 @@ def every_2_s(person: Skin, skin: jawusd.evaluator.skin.Skin, head: tuple[float,
 def followed(d: np.ndarray, seen: np.ndarray, by_skin: SkinJaw) -> tuple[np.ndarray, np.ndarray]:
     """Return d and its variances (F, 3) from d of frames with visible teeth, and skin, as it arrives."""
     slow, found, variance = SkinFilter(), np.zeros_like(d), np.full_like(d, LARGEST_SIGMA[6] ** 2)
-    step = (live._WIDER * motion._MISS[6]) ** 2
+    step = (VARIANCE_RATIO * motion._MISS[6]) ** 2
     for k in range(len(d)):
         start = d[k] if seen[k] else found[k - 1]
         size = np.full(3, SIGMA_MM**2) if seen[k] else np.minimum(variance[k - 1] + step, LARGEST_SIGMA[6] ** 2)

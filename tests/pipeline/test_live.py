@@ -28,7 +28,7 @@ from jawusd.pipeline.subject import load_labelled, registered_meshes
 from jawusd.pipeline.videos import Cutter, PreparedTeeth
 from jawusd.pipeline.workspace import open_capture
 from jawusd.segmentation.picture import ColourFootage
-from jawusd.tracking.region.live import LiveTake
+from jawusd.tracking.region.performance import LiveTake
 
 EXAMPLE, FPS = ROOT / "examples" / "capture", 24.0
 

@@ -18,7 +18,7 @@ from jawusd.geometry import (
 from jawusd.synthetic.exercises import record
 from jawusd.synthetic.person import Person
 from jawusd.tracking.contour.quality import landmark_sigmas, relative_covariance
-from jawusd.tracking.region.condyle_fusion import CondyleFusion
+from jawusd.tracking.region.jaw_priors import CondyleFusion
 from jawusd.tracking.region.tracker import RegionPose
 
 HEAD = make_transform(so3_exp(np.array([0.3, -2.0, 0.4])), [12.0, -30.0, 210.0])

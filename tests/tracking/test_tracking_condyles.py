@@ -10,8 +10,7 @@ from jawusd.geometry import make_transform, relative_pose, se3_exp, so3_exp, tra
 from jawusd.synthetic.exercises import record
 from jawusd.synthetic.person import Person
 from jawusd.tracking.contour.equations import NormalEquations, OutlineSums, Solution, motion_about
-from jawusd.tracking.region.condyle_fusion import widen_strained
-from jawusd.tracking.region.jaw_priors import CondyleMotion, CondyleTerm
+from jawusd.tracking.region.jaw_priors import CondyleMotion, CondyleTerm, widen_strained
 
 SURE = np.diag([1e-6] * 3 + [1e-4] * 3)
 HEAD = make_transform(so3_exp(np.array([0.3, -2.0, 0.4])), [12.0, -30.0, 210.0])

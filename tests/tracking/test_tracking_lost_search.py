@@ -14,7 +14,7 @@ from jawusd.geometry import se3_exp, transform_point
 from jawusd.tracking.follow import TwoWays
 from jawusd.tracking.initialization.footage import MaskSurvey
 from jawusd.tracking.initialization.start_search import _opened
-from jawusd.tracking.sequence.lost_search import LostSearch
+from jawusd.tracking.sequence.passes import LostSearch
 
 FRAMES = 13
 # Counted from the first frame. After so many lost frames, the tracker itself seldom searches.

@@ -14,8 +14,7 @@ from jawusd.evaluator import JawRig
 from jawusd.formats.tracks import LOST, RECOVERED
 from jawusd.geometry import make_transform, relative_pose, se3_exp, transform_point, transform_points
 from jawusd.tracking.contour.equations import NormalEquations, OutlineSums, Solution
-from jawusd.tracking.sequence.kinematic_prior import KinematicPrior
-from jawusd.tracking.sequence.model_refinement import hard_frames, refine_tracks
+from jawusd.tracking.sequence.model_refinement import KinematicPrior, hard_frames, refine_tracks
 
 COUNT = 24
 SPREAD_MM = 0.1

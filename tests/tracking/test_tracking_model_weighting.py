@@ -9,7 +9,7 @@ from example_tracks import make_tracks
 from scipy.optimize import minimize
 
 from jawusd.geometry import se3_exp, se3_inverse, se3_log, transform_points
-from jawusd.tracking.sequence.kinematic_prior import KinematicPrior, weigh_with_model
+from jawusd.tracking.sequence.model_refinement import KinematicPrior, weigh_with_model
 
 COUNT = 60
 OFF_MM = 0.1  # distance of the true motion from the model

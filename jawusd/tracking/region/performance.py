@@ -1,8 +1,9 @@
-"""A performance solved from images without masks: frame by frame in both directions, then all frames jointly."""
+"""Head and jaw of a subject with a rig in images without masks: recorded takes, solved jointly, and live tracking."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,18 +14,19 @@ from jawusd.evaluator.skin import SkinJaw
 from jawusd.formats.performance import Performance
 from jawusd.geometry import Camera, transform_points
 from jawusd.tracking.contour.annotator import AnnotatorPrior
-from jawusd.tracking.contour.quality import score_px
+from jawusd.tracking.contour.quality import residual_px, score_px
 from jawusd.tracking.contour.scan import Scan, teeth_centre, thinned
 from jawusd.tracking.contour.solver import ContourSolver
 from jawusd.tracking.follow import Begin, TwoWays, both_ways
 from jawusd.tracking.performance.attempts import FrameFit
-from jawusd.tracking.performance.coordinates import Coordinates, Pose
-from jawusd.tracking.performance.instant import InstantSolver
+from jawusd.tracking.performance.coordinates import JAW, Coordinates, Pose
+from jawusd.tracking.performance.instant import InstantSolver, rig_gain
 from jawusd.tracking.performance.motion import KNOWN, STEADY
 from jawusd.tracking.performance.results import performance_of
 from jawusd.tracking.performance.skin import SkinOf, jaw_of_skin
-from jawusd.tracking.performance.smoother import Smoothed, Smoother, with_one_head
-from jawusd.tracking.region.appearance import Cut, LearnedColours
+from jawusd.tracking.performance.smoother import VARIANCE_RATIO, Smoothed, Smoother, with_one_head
+from jawusd.tracking.region.appearance import CORRELATION_PX, Cut, LearnedColours
+from jawusd.tracking.region.effort import FAST
 from jawusd.tracking.region.rig_tracker import FOR_RIGS, RigTracker
 from jawusd.tracking.region.search import FACES, REDRAW_PX, SAMPLE_STEP_PX
 
@@ -257,3 +259,86 @@ def _zoomed(camera: Camera, factor: float) -> Camera:
     K = camera.K.copy()
     K[[0, 1], [0, 1]] *= factor
     return replace(camera, K=K)
+
+
+# Number of crown faces and settings, which are coarser than for recorded images, since dropped frames reduce accuracy
+# more than coarse settings.
+_LIVE_FACES = 3_000
+_LIVE_SETTINGS = replace(FOR_RIGS, sample_step_px=3.0, redraw_px=4.0, parallax_px=6.0, settled_mm=0.4, judged_mm=0.3)
+
+
+class LiveTake:
+    """Live tracker of head and jaw of a subject with a known rig; `coordinates` convert its poses."""
+
+    def __init__(
+        self,
+        jaw: JawRig,
+        scans: Sequence[Scan],
+        axes: Array,
+        cameras: Sequence[Camera],
+        *,
+        fixed_head: bool = False,
+        executor: Executor | None = None,
+    ) -> None:
+        """Prepare the scans for tracking.
+
+        Args:
+            jaw: the subject's rig.
+            scans: upper and lower teeth, prepared.
+            axes: rotation from scan to anatomical axes: left, up, front; shape (3, 3).
+            cameras: cameras in the order of the images.
+            fixed_head: whether the cameras are head-mounted, so that the head hardly moves relative to them.
+            executor: thread pool in which the contours of all cameras are matched in parallel.
+        """
+        self._scans, self._axes, self._cameras = [thinned(scan, _LIVE_FACES) for scan in scans], axes, cameras
+        self._head = STEADY if fixed_head else 1.0
+        self.coordinates = Coordinates(jaw, self._scans)
+        self._instants = InstantSolver(ContourSolver(self._scans, _LIVE_SETTINGS, executor), self.coordinates)
+        self._tracker: RigTracker | None = None
+
+    def begin(self, cut: Cut, near: Pose) -> float:
+        """Learn the colours of a frame near a pose; return its `RigTracker.first_fit`, 0 .. 1."""
+        colours = LearnedColours(self._scans, self._cameras, self._axes)
+        self._tracker = RigTracker(self._instants, colours, head=self._head, effort=FAST)
+        self._tracker.begin(cut, near, searched=True)
+        return self._tracker.first_fit
+
+    def _begun(self, method: str) -> RigTracker:
+        if self._tracker is None:
+            raise ValueError(f"`{method}` was called before `begin`")
+        return self._tracker
+
+    def step(self, cut: Cut, frames: float = 1.0) -> FrameFit:
+        """Align the images taken `frames` frames after the previous ones.
+
+        Raises:
+            ValueError: `begin` was not called.
+        """
+        return self._begun("step").step(cut, frames)
+
+    def carry(self, d: Array, covariance: Array) -> None:
+        """Replace d of a frame with hidden teeth, from which the next step starts.
+
+        Args:
+            d: jaw parameters [mm], shape (3,).
+            covariance: their covariance [mm^2], shape (3, 3).
+
+        Raises:
+            ValueError: `begin` was not called.
+        """
+        self._begun("carry").carry(d, np.diag(covariance) / VARIANCE_RATIO)
+
+    def covariance_d(self, fit: FrameFit) -> Array:
+        """Return the covariance of the jaw parameters d in the last step [mm^2], including the rig error (3, 3).
+
+        Raises:
+            ValueError: `begin` was not called.
+        """
+        precision, of_rig = np.diag(self._begun("covariance_d").expected.precision), np.zeros((3, 3))
+        if fit.solution is not None and fit.found.any():
+            weight = np.where(fit.found, 1.0 / (residual_px(fit.solution) ** 2 * CORRELATION_PX), 0.0)
+            outlines = self._instants.outline_equations(fit.pose, fit.solution, weight)
+            precision = precision + outlines.matrix
+            gain = rig_gain(self.coordinates, fit.pose, precision, outlines.misfit.precision)
+            of_rig = gain @ self.coordinates.jaw.pose_covariance(fit.pose.d) @ gain.T
+        return np.asarray(VARIANCE_RATIO * np.linalg.inv(precision)[JAW, JAW] + of_rig, np.float64)

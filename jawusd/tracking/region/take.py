@@ -22,7 +22,7 @@ from jawusd.tracking.contour.scan import ARCHES, Scan
 from jawusd.tracking.contour.views import View
 from jawusd.tracking.initialization.magnification import measure_magnification
 from jawusd.tracking.region.appearance import CORRELATION_PX
-from jawusd.tracking.region.condyle_fusion import CondyleFusion
+from jawusd.tracking.region.jaw_priors import CondyleFusion
 from jawusd.tracking.region.tracker import RegionPose
 from jawusd.tracking.sequence.closed_bite import RestFrames, observe_bite, rest_frames
 from jawusd.tracking.sequence.extrinsics import Extrinsics

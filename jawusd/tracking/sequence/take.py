@@ -28,9 +28,8 @@ from jawusd.tracking.initialization.start_search import StartSearch
 from jawusd.tracking.sequence.closed_bite import RestFrames, observe_bite, rest_frames
 from jawusd.tracking.sequence.delays import BRIDGE_FRAMES, bridge, delay_motions
 from jawusd.tracking.sequence.extrinsics import Extrinsics
-from jawusd.tracking.sequence.lost_search import LostSearch
 from jawusd.tracking.sequence.nuisance import Nuisances, TakeEquations
-from jawusd.tracking.sequence.passes import Passes, Progress, mark_poorly_seen_lost
+from jawusd.tracking.sequence.passes import LostSearch, Passes, Progress, mark_poorly_seen_lost
 from jawusd.tracking.sequence.results import assemble, outline_variance
 from jawusd.tracking.sequence.take_checks import (
     lens_findings,
