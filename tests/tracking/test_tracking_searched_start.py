@@ -127,7 +127,7 @@ def test_a_frame_with_wrong_poses_is_skipped(footage):
 
 def test_poor_poses_are_not_evidence_against_masks(footage, monkeypatch):
     def accuse(footage, solver, poses, frame):
-        return possible_exchanges(footage.sources)[0] if frame == search.asked[0] else None
+        return possible_exchanges(footage)[0] if frame == search.asked[0] else None
 
     monkeypatch.setattr(take_start, "likely_exchange", accuse)
     search = _FoundBefore([0.1, 0.5])

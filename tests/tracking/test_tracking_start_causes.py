@@ -34,7 +34,7 @@ def test_exchanges_are_suspected_only_of_masks_that_do_not_fit(monkeypatch, give
     footage = Footage(sources, TABLE, OFFSETS, (0, 10))
     found = start_causes.likely_exchange(footage, None, np.stack([np.eye(4)] * 2), 3)
     assert (found is not None) == suspected
-    assert not suspected or "cam1 and cam2 are exchanged" in found.finding
+    assert not suspected or "cam1 and cam2 are exchanged" in found.message
 
 
 @pytest.mark.parametrize(

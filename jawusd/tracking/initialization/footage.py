@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,6 +40,11 @@ class Footage:
     def files(self) -> list[CameraSource]:
         """The cameras whose masks are files."""
         return [source for source in self.sources if isinstance(source, CameraSource)]
+
+    def without_each_camera(self) -> Iterator[tuple[str, Footage]]:
+        """Yield the name of each camera, and the footage of the others; nothing with fewer than three cameras."""
+        for source in self.sources if len(self.sources) >= 3 else ():
+            yield source.name, replace(self, sources=[other for other in self.sources if other is not source])
 
     def survey(self, frames: tuple[int, int] | None, count: int) -> MaskSurvey:
         """Measure the masks of at most `count` evenly spaced frames, by default from the whole footage.

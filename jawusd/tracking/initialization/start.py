@@ -82,7 +82,7 @@ def search_start(search: StartSearch, footage: Footage, suspects: Collection[str
         if exchange is not None:
             if found.fit >= CLEAR_FIT:
                 raise exchange.error(frame)
-            failed[frame] = exchange.finding
+            failed[frame] = exchange.message
             suspected.add(exchange.hint)
             continue
         if best is None or found.fit > best[1].fit:
@@ -127,29 +127,26 @@ def fit_without_a_camera(
     if len(footage.sources) < 3 or _fits(search, footage, found.poses, frame):
         return None
     better = []
-    for source in footage.sources:
-        others = replace(footage, sources=[other for other in footage.sources if other is not source])
+    for name, others in footage.without_each_camera():
         with contextlib.suppress(TrackingError):
             near = search.near(others, frame, poses)
             if near.fit >= CLEAR_FIT:
                 aligned(search, others, near.poses, frame)
-                better.append((source.name, near))
+                better.append((name, near))
     return max(better, key=lambda one: one[1].fit, default=None)
 
 
 def _check_upright(search: StartSearch, footage: Footage, frame: int, found: SearchResult) -> None:
     """Reject masks that fit better with the arches swapped: an upside-down upper arch resembles a lower one."""
-    exchange = all_arches_exchanged(footage.files)
+    exchange = all_arches_exchanged(footage)
     try:
-        other = search.at(replace(footage, sources=exchange.sources), frame)
+        other = search.at(exchange.footage, frame)
     except TrackingError:
         return
     if other.objective_px > found.objective_px:
-        raise TrackingError(
-            f"{exchange.finding}: {other.objective_px:.0f} px of contour match after exchanging them, "
-            f"{found.objective_px:.0f} px as given",
-            frame=frame,
-            hint=exchange.hint,
+        evidence = f"{other.objective_px:.0f} px of contour match after exchanging them"
+        raise replace(exchange, message=f"{exchange.message}: {evidence}, {found.objective_px:.0f} px as given").error(
+            frame
         )
 
 

@@ -25,44 +25,45 @@ _ODD_SHARE = 0.05  # uncovered fraction of masks above which a swap is suspected
 
 
 @dataclass(frozen=True, eq=False)
-class MaskExchange:
-    """A possible swap of masks."""
+class Cause:
+    """A possible mistake in the inputs, and the inputs after correcting it."""
 
-    finding: str  # description of the swap
-    hint: str  # instruction for correcting the swap
-    sources: tuple[CameraSource, ...]  # sources of the cameras' masks, with the swap corrected
+    message: str
+    hint: str
+    footage: Footage
+    search: StartSearch | None = None  # a search with corrected scans; None: with the given ones
 
     def error(self, frame: int) -> TrackingError:
-        """Return the error that reports the swap."""
-        return TrackingError(self.finding, frame=frame, hint=self.hint)
+        """Return the error that reports the mistake."""
+        return TrackingError(self.message, frame=frame, hint=self.hint)
 
 
-def all_arches_exchanged(sources: Sequence[CameraSource]) -> MaskExchange:
+def all_arches_exchanged(footage: Footage) -> Cause:
     """Return the swap of arches in all cameras; swapped scan files have the same effect."""
-    return MaskExchange(
+    return Cause(
         "the masks of the upper and lower teeth are exchanged in every camera",
         "Exchange masks.upper and masks.lower, or upper_teeth and lower_teeth in [scans].",
-        _with_masks(sources, {k: _masks(s).exchanged for k, s in enumerate(sources)}),
+        _with_masks(footage, {k: _masks(source).exchanged for k, source in enumerate(footage.files)}),
     )
 
 
-def possible_exchanges(sources: Sequence[CameraSource]) -> list[MaskExchange]:
+def possible_exchanges(footage: Footage) -> list[Cause]:
     """Return every swap of arches in one camera or in all, and of masks between two cameras."""
-    out = []
+    out, sources = [], footage.files
     for k, source in enumerate(sources):
         message = f"the masks of the upper and lower teeth are exchanged in camera {source.name}"
         hint = f"Exchange masks.upper and masks.lower of camera {source.name}."
-        out.append(MaskExchange(message, hint, _with_masks(sources, {k: _masks(source).exchanged})))
-    out.append(all_arches_exchanged(sources))
+        out.append(Cause(message, hint, _with_masks(footage, {k: _masks(source).exchanged})))
+    out.append(all_arches_exchanged(footage))
     for a, b in combinations(range(len(sources)), 2):
         both = f"cameras {sources[a].name} and {sources[b].name}"
         hint = f"Exchange the masks of {both}, or their entries in the calibration."
-        swapped = _with_masks(sources, {a: _masks(sources[b]), b: _masks(sources[a])})
-        out.append(MaskExchange(f"the masks of {both} are exchanged", hint, swapped))
+        swapped = _with_masks(footage, {a: _masks(sources[b]), b: _masks(sources[a])})
+        out.append(Cause(f"the masks of {both} are exchanged", hint, swapped))
     return out
 
 
-def likely_exchange(footage: Footage, solver: ContourSolver, poses: Array, frame: int) -> MaskExchange | None:
+def likely_exchange(footage: Footage, solver: ContourSolver, poses: Array, frame: int) -> Cause | None:
     """Return the swap that best explains why masks lie outside their scans, with its evidence; None if no swap does.
 
     A camera whose masks fit as given takes part in no swap. `poses` are T_world_upper and T_world_lower of the frame,
@@ -71,17 +72,17 @@ def likely_exchange(footage: Footage, solver: ContourSolver, poses: Array, frame
     given = _uncovered_shares(footage, solver, poses, frame)
     if not (given >= _ODD_SHARE).any():
         return None
-    found: list[tuple[float, float, MaskExchange]] = []
-    for exchange in possible_exchanges(footage.files):
-        if _sizes_differ(footage, exchange.sources):
+    found: list[tuple[float, float, Cause]] = []
+    for exchange in possible_exchanges(footage):
+        if _sizes_differ(footage, exchange.footage.files):
             continue
         try:
-            shares = _uncovered_shares(replace(footage, sources=exchange.sources), solver, poses, frame)
+            shares = _uncovered_shares(exchange.footage, solver, poses, frame)
         except CaptureError:
             continue  # mask videos differ in length from the clips of the cameras to which they would be assigned
         # If a swap leaves a camera without masks in this frame, that does not count against the swap.
         both = np.isfinite(given) & np.isfinite(shares)
-        changed = [one.masks != other.masks for one, other in zip(footage.files, exchange.sources, strict=True)]
+        changed = [one.masks != other.masks for one, other in zip(footage.files, exchange.footage.files, strict=True)]
         fitting = given[changed] < _ODD_SHARE
         if (given[both] >= _ODD_SHARE).any() and not fitting.any():
             found.append((float(shares[both].mean()), float(given[both].mean()), exchange))
@@ -91,7 +92,7 @@ def likely_exchange(footage: Footage, solver: ContourSolver, poses: Array, frame
     if share >= _PROOF * before:
         return None
     evidence = f"{before:.0%} of the mask area lies outside the scans, {share:.0%} after exchanging them"
-    return replace(exchange, finding=f"{exchange.finding}: {evidence}")
+    return replace(exchange, message=f"{exchange.message}: {evidence}")
 
 
 def _uncovered_shares(footage: Footage, solver: ContourSolver, poses: Array, frame: int) -> Array:
@@ -108,8 +109,9 @@ def _masks(source: CameraSource) -> Masks:
     return source.masks
 
 
-def _with_masks(sources: Sequence[CameraSource], masks: dict[int, Masks]) -> tuple[CameraSource, ...]:
-    return tuple(s.model_copy(update={"masks": masks.get(k, s.masks)}) for k, s in enumerate(sources))
+def _with_masks(footage: Footage, masks: dict[int, Masks]) -> Footage:
+    sources = [s.model_copy(update={"masks": masks.get(k, s.masks)}) for k, s in enumerate(footage.files)]
+    return replace(footage, sources=sources)
 
 
 def _sizes_differ(footage: Footage, sources: Sequence[CameraSource]) -> bool:
@@ -125,16 +127,6 @@ _MOST_CAMERAS = 4  # maximum number of cameras for which swaps are tried, since 
 MOST_PICTURES = 120
 # Scan sizes that are tried, relative to the given size [-]; each is close enough for teeth up to 5 % larger or smaller.
 _SIZES = (0.95, 1.05, 0.86, 1.16, 0.77, 1.28)
-
-
-@dataclass(frozen=True, eq=False)
-class _Cause:
-    """A suspected input error, with the search and footage after correcting it."""
-
-    message: str
-    hint: str
-    search: StartSearch
-    footage: Footage
 
 
 def aligned(search: StartSearch, footage: Footage, poses: Array, frame: int) -> Array:
@@ -174,19 +166,19 @@ def raise_cause(
     Raises:
         TrackingError: a mistake explains the failure; the message describes it.
     """
-    exchanges = sorted(_exchanges(search, footage), key=lambda cause: cause.hint not in suspected)
+    exchanges = sorted(_exchanges(footage), key=lambda cause: cause.hint not in suspected)
     sizes = [*_sizes(search, footage)]
     message = "the scans are mirrored: left and right are exchanged"
     hint = "Export them again without mirroring; one axis may have been negated."
-    hands, cameras = [_Cause(message, hint, search.mirrored(), footage)], [*_cameras(search, footage)]
+    hands, cameras = [Cause(message, hint, footage, search.mirrored())], [*_cameras(footage)]
     groups = (sizes, hands, exchanges, cameras) if SIZE_HINT in suspected else (hands, exchanges, sizes, cameras)
     count = sum(map(len, groups))
     pictures = sum(len(cause.footage.sources) for group in groups for cause in group)
     frames = frames[: max(1, MOST_PICTURES // pictures)]
-    tried = _raise_cause_on(frames[0], groups, only_clear)
+    tried = _raise_cause_on(search, frames[0], groups, only_clear)
     raise_for_unmatched_arch(fits)
     for frame in frames[1:]:
-        _raise_cause_on(frame, groups, only_clear)
+        _raise_cause_on(search, frame, groups, only_clear)
     where = f"frame{'s' if len(frames) > 1 else ''} {', '.join(map(str, frames))}"
     sentence = f"Correcting any of {tried} possible mistakes in masks, scans and calibration does not help on {where}"
     if tried == count:
@@ -194,22 +186,21 @@ def raise_cause(
     return f"{sentence}; {count - tried} more were not tried, since at most {MOST_PICTURES} images are searched."
 
 
-def _raise_cause_on(frame: int, groups: Sequence[Sequence[_Cause]], only_clear: bool) -> int:
+def _raise_cause_on(search: StartSearch, frame: int, groups: Sequence[Sequence[Cause]], only_clear: bool) -> int:
     """Raise an error for a mistake if correcting it makes the search succeed; return the number of mistakes tried."""
     tried, pictures = 0, 0
     for causes in groups:
-        explained: list[tuple[float, _Cause]] = []
+        explained: list[tuple[float, Cause]] = []
         for cause in causes:
             pictures += len(cause.footage.sources)
             if pictures > MOST_PICTURES:
                 break
-            explained.append((_fit(cause, frame), cause))
+            explained.append((_fit(cause.search or search, cause.footage, frame), cause))
         tried += len(explained)
         least = CLEAR_FIT if only_clear or len(explained) < len(causes) else EXPLAINS
         fit, best = max(explained, key=lambda one: one[0], default=(0.0, None))
         if best is not None and fit >= least:
-            message = f"{best.message}: the teeth are found only after correcting this"
-            raise TrackingError(message, frame=frame, hint=best.hint)
+            raise replace(best, message=f"{best.message}: the teeth are found only after correcting this").error(frame)
     return tried
 
 
@@ -235,52 +226,40 @@ def raise_for_unmatched_arch(fits: Mapping[int, Array]) -> None:
     )
 
 
-def _fit(cause: _Cause, frame: int) -> float:
-    """Return the fit of the teeth with a mistake corrected [-]; zero if the teeth are not found."""
+def _fit(search: StartSearch, footage: Footage, frame: int) -> float:
+    """Return the fit of the teeth in a frame [-]; zero if they are not found."""
     try:
-        found = cause.search.at(cause.footage, frame)
+        found = search.at(footage, frame)
         if found.fit < EXPLAINS:
             return 0.0
-        aligned(cause.search, cause.footage, found.poses, frame)
+        aligned(search, footage, found.poses, frame)
     except (TrackingError, CaptureError):
         return 0.0
     return found.fit
 
 
-def _exchanges(search: StartSearch, footage: Footage) -> Iterator[_Cause]:
+def _exchanges(footage: Footage) -> Iterator[Cause]:
     """Yield swaps of masks and of calibrations."""
     if len(footage.sources) > _MOST_CAMERAS:
         return
-    for exchange in possible_exchanges(footage.files):
-        yield _Cause(exchange.finding, exchange.hint, search, replace(footage, sources=exchange.sources))
+    yield from possible_exchanges(footage)
     for a, b in combinations([source.name for source in footage.sources], 2):
         if footage.offsets[a] != footage.offsets[b]:  # with equal offsets, this is identical to a swap of masks
             cameras = {**footage.cameras, a: footage.cameras[b], b: footage.cameras[a]}
             message = f"the calibrations of cameras {a} and {b} are exchanged"
             hint = f"Exchange the names {a} and {b} in the calibration."
-            yield _Cause(message, hint, search, replace(footage, cameras=cameras))
+            yield Cause(message, hint, replace(footage, cameras=cameras))
 
 
-def _sizes(search: StartSearch, footage: Footage) -> Iterator[_Cause]:
+def _sizes(search: StartSearch, footage: Footage) -> Iterator[Cause]:
     for size in _SIZES:
-        yield _Cause(
-            f"the scans are about {abs(size - 1.0):.0%} too {'large' if size > 1.0 else 'small'}: the scale of "
-            "the scans or of the calibration is wrong",
-            SIZE_HINT,
-            search.scaled(1.0 / size),
-            footage,
-        )
+        message = f"the scans are about {abs(size - 1.0):.0%} too {'large' if size > 1.0 else 'small'}: the scale of "
+        message += "the scans or of the calibration is wrong"
+        yield Cause(message, SIZE_HINT, footage, search.scaled(1.0 / size))
 
 
-def _cameras(search: StartSearch, footage: Footage) -> Iterator[_Cause]:
-    if len(footage.sources) < 3:
-        return
-    for source in footage.sources:
-        others = replace(footage, sources=[other for other in footage.sources if other is not source])
-        yield _Cause(
-            f"camera {source.name} contradicts the other cameras: its calibration is wrong (focal length, principal "
-            "point), it was turned or moved since, or its masks belong to another frame",
-            f"Calibrate camera {source.name} again, check its time offset, or exclude it.",
-            search,
-            others,
-        )
+def _cameras(footage: Footage) -> Iterator[Cause]:
+    for name, others in footage.without_each_camera():
+        message = f"camera {name} contradicts the other cameras: its calibration is wrong (focal length, principal "
+        message += "point), it was turned or moved since, or its masks belong to another frame"
+        yield Cause(message, f"Calibrate camera {name} again, check its time offset, or exclude it.", others)
