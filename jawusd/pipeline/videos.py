@@ -234,7 +234,7 @@ class PreparedTeeth:
         teeth = meshes["upper_teeth"], meshes["lower_teeth"]
         self.scans = prepare_scan(teeth[0], "upper"), prepare_scan(teeth[1], "lower")
         self.axes = subject_of_capture(capture, meshes).T_anatomical_skull[:3, :3]
-        self.search = PictureStart(teeth, self.scans, jaw, capture.anatomy.T_anatomical_skull, map_)
+        self.search = PictureStart(ArchStart(teeth, self.scans, capture.anatomy.T_anatomical_skull, map_), jaw)
 
 
 class VideoShot:

@@ -11,7 +11,7 @@ import numpy as np
 
 from jawusd.base.arrays import Array
 from jawusd.base.errors import TrackingError
-from jawusd.formats.capture import Pick
+from jawusd.formats.capture import Bootstrap, Pick
 from jawusd.geometry import (
     Camera,
     mandible_metric,
@@ -22,6 +22,7 @@ from jawusd.geometry import (
     triangulate,
 )
 from jawusd.tracking.contour.equations import motion_about
+from jawusd.tracking.contour.scan import ARCH_NAMES
 
 #: Minimum number of picks on an arch.
 FEWEST_PICKS = 3
@@ -101,6 +102,12 @@ def pose_from_picks(
             )
         best = _refined(good, best)
     return best, [s.number for s in sightings if s not in good]
+
+
+def poses_from_picks(bootstrap: Bootstrap, vertices: Sequence[Array], cameras: Mapping[str, Camera]) -> Array:
+    """Return T_world_upper and T_world_lower from the picks on both arches, shape (2, 4, 4); see `pose_from_picks`."""
+    given = zip((bootstrap.upper, bootstrap.lower), vertices, ARCH_NAMES, strict=True)
+    return np.stack([pose_from_picks(picks, points, cameras, arch)[0] for picks, points, arch in given])
 
 
 def _other_size(sightings: Sequence[_Sighting]) -> float | None:

@@ -21,7 +21,7 @@ from jawusd.tracking.contour.quality import coverage_error, uncovered_px
 from jawusd.tracking.contour.scan import Scan, prepare_scan
 from jawusd.tracking.contour.solver import ContourSolver
 from jawusd.tracking.contour.views import View, present_masks
-from jawusd.tracking.initialization.bootstrap import pose_from_picks
+from jawusd.tracking.initialization.bootstrap import poses_from_picks
 from jawusd.tracking.initialization.first_frame import FIRST_ROUNDS, first_record
 from jawusd.tracking.sequence.frame_tracker import FrameTracker
 from jawusd.tracking.sequence.history import History
@@ -53,8 +53,8 @@ class GuidedTracker:
             TrackingError: a scan cannot be tracked.
         """
         self._config = config or FOR_AUTO_MASKS
-        self._meshes = {"upper": upper, "lower": lower}
-        scans = [prepare_scan(mesh, arch) for arch, mesh in self._meshes.items()]
+        self._vertices = upper.vertices, lower.vertices
+        scans = prepare_scan(upper, "upper"), prepare_scan(lower, "lower")
         self._solver = ContourSolver(scans, self._config, executor)
         self._see, self._rounds = see, rounds
 
@@ -74,10 +74,7 @@ class GuidedTracker:
                 hint="Pick vertices on the page of `jawusd view CAPTURE`, or add [bootstrap]: three or more vertices "
                 "of each scan with their pixels in two cameras.",
             )
-        picks = {"upper": bootstrap.upper, "lower": bootstrap.lower}
-        return np.stack(
-            [pose_from_picks(picks[arch], mesh.vertices, cameras, arch)[0] for arch, mesh in self._meshes.items()]
-        )
+        return poses_from_picks(bootstrap, self._vertices, cameras)
 
     def begin(self, frame: int, poses: Array) -> FrameRecord:
         """Align the first frame from picked poses; raises TrackingError if the teeth do not fit the views."""
