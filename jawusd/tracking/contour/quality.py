@@ -31,6 +31,11 @@ def matched_px(solution: Solution) -> Array:
     return np.asarray(solution.outline.matched_px.sum(1))
 
 
+def fitting_share(solution: Solution) -> Array:
+    """Return the matched fraction of the visible contour, weighted by closeness, per arch [-], shape (2,)."""
+    return np.asarray(score_px(solution).sum(1) / np.maximum(solution.visible_px.sum(1), 1.0), np.float64)
+
+
 def residual_px(solution: Solution) -> Array:
     """Return the standard deviation of the matched residuals per arch [px], shape (2,); NaN without matches."""
     with np.errstate(invalid="ignore", divide="ignore"):

@@ -13,7 +13,7 @@ from jawusd.formats.tracks import PARTIAL, TRACKED
 from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.contour.equations import Solution
 from jawusd.tracking.contour.frame_record import FrameRecord
-from jawusd.tracking.contour.quality import arch_fit, coverage_error, score_px, uncovered_px
+from jawusd.tracking.contour.quality import arch_fit, coverage_error, fitting_share, score_px, uncovered_px
 from jawusd.tracking.contour.scan import ARCH_NAMES, ARCHES
 from jawusd.tracking.contour.solver import ContourSolver
 from jawusd.tracking.contour.views import FEWEST_MASKS, View, present_masks
@@ -109,8 +109,7 @@ def _aligned(solver: ContourSolver, config: TrackingConfig, start: Array, views:
 
 def _problem(first: _Aligned, config: TrackingConfig) -> str | None:
     """Return the reason for which an alignment is rejected; None if it is accepted."""
-    for r in ARCHES:
-        share = score_px(first.solution)[r].sum() / max(first.solution.visible_px[r].sum(), 1.0)
+    for r, share in enumerate(fitting_share(first.solution)):
         uncovered = np.nanmedian(first.coverage[r, first.use[r]])
         if share < config.first_share or uncovered > config.lost_coverage or first.fit[r] < LEAST_FIT:
             return (

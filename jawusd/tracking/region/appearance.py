@@ -69,13 +69,7 @@ class LearnedColours:
     """Colour models of all cameras, and offsets between observed gum lines and those of the scans."""
 
     def __init__(self, scans: Sequence[Scan], cameras: Sequence[Camera], axes: Array) -> None:
-        """Start without learned colours.
-
-        Args:
-            scans: upper and lower scan, in one coordinate frame.
-            cameras: cameras in the order of the images.
-            axes: rotation from scan to anatomical axes: left, up, front; shape (3, 3).
-        """
+        """Start without learned colours; `axes` is the rotation from scan to left, up and front axes, (3, 3)."""
         self._scans, self._cameras, self.axes = tuple(scans), tuple(cameras), axes
         # The clustering is seeded, so that the same scans give the same patches.
         crowns = [scan.crown_vertices(3000) @ axes.T[:, [0, 2]] for scan in scans]
@@ -94,12 +88,7 @@ class LearnedColours:
         self._colours = [None if p is None else first_colours(p, poses, self._scans) for p in pictures]
 
     def views(self, pictures: Sequence[Picture | None], before: Array) -> list[View]:
-        """Return the views of a video frame.
-
-        Args:
-            pictures: one image per camera.
-            before: T_world_upper and T_world_lower in the previous frame, shape (2, 4, 4).
-        """
+        """Return the views of a frame, given its images and the poses in the frame `before`, shape (2, 4, 4)."""
         out = []
         for c, picture in enumerate(pictures):
             colours = self._colours[c]
@@ -138,10 +127,7 @@ class LearnedColours:
     ) -> None:
         """Update the colour models with the colours on both sides of matched borders, and update the gum-line offset.
 
-        Args:
-            views: views of the images, which contain the colour counts of one alignment.
-            pictures, poses: images and poses of the same frame.
-            rates: learning rates of tooth and background colours, 0 .. 1.
+        The views of the images have the colour counts of one alignment; rates of tooth and background are 0 .. 1.
         """
         for c, view in enumerate(views):
             colours = self._colours[c]

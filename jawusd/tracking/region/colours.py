@@ -23,8 +23,7 @@ _REACH = 2  # radius of the blur kernel [bins]
 _SPREAD = gaussian_filter1d(np.eye(1 << _BITS), _BLUR, axis=0, mode="nearest", radius=_REACH)
 _LOCAL = 0.5  # weight of a patch's own histogram in its colour model
 _MOST = 3.0  # maximum magnitude of the log ratios, since no colour is conclusive
-# weight of skin and lips in the background model
-_LIPS = 0.2
+_LIPS = 0.2  # weight of skin and lips in the background model
 _EMPTY = 2e-5  # probability assigned to unseen colours
 _ENOUGH = 200.0  # minimum number of counts for a new histogram to have full weight
 _ROUNDS = 3  # number of iterations that separate lips from teeth among the pixels under crowns
@@ -54,8 +53,7 @@ class Areas:
     crowns: Mask  # pixels well inside projected crowns
     ring: Mask  # pixels around projected crowns, within reach of the search
     gum: Mask  # pixels under projected gum, away from crowns
-    # pixels away from the teeth: skin and lips
-    far: Mask
+    far: Mask  # pixels away from the teeth: skin and lips
 
 
 class CameraColours:
@@ -86,11 +84,7 @@ class CameraColours:
         self.ratio = self._ratio()
 
     def learn(self, tooth: Array, outside: Array, rates: tuple[float, float]) -> None:
-        """Blend in the colours counted on both sides of matched borders, each of shape (2, TABLES, BINS).
-
-        Args:
-            rates: weight of new tooth and of new outside colours, 0 .. 1.
-        """
+        """Blend in the colours (2, TABLES, BINS) counted on both sides of matched borders, with weights 0 .. 1."""
         # Tooth edges and gum line of a patch belong to the same teeth, so their tooth colours are pooled.
         both = tooth.reshape(2, PATCHES, KINDS, BINS).sum(2)
         _blend(self._local_tooth.reshape(-1, KINDS, BINS), both.reshape(-1, BINS), rates[0])

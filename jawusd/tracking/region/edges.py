@@ -302,9 +302,7 @@ def count_colours(
 ) -> None:
     """Count the colours on both sides of borders found within 2 px.
 
-    Args:
-        near_px, far_px: minimum and maximum distance from the contour of the pixels counted.
-        tooth, outside: counts to update, shape (T, B).
+    Pixels from `near_px` to `far_px` away from the contour are added to the counts `tooth` and `outside` (T, B).
     """
     for s in range(len(samples)):
         if not clearness[s] > 0.3 or not abs(distances[s]) < 2:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from jawusd.base.arrays import Array, Mask
+from jawusd.tracking.contour.quality import fitting_share
 from jawusd.tracking.contour.scan import CROWN
 from jawusd.tracking.contour.solver import Matched
 from jawusd.tracking.contour.views import present_masks
@@ -16,7 +17,7 @@ from jawusd.tracking.performance.coordinates import Pose
 from jawusd.tracking.performance.instant import Aligned, Expected, InstantSolver
 from jawusd.tracking.performance.views import growth_of
 from jawusd.tracking.region.appearance import LearnedColours, Picture
-from jawusd.tracking.region.search import BORDER_PX3, LAST_GATES_PX, fitting_share, fraction_in_sight
+from jawusd.tracking.region.search import BORDER_PX3, LAST_GATES_PX, fraction_in_sight
 
 
 class InstantImages:

@@ -110,10 +110,7 @@ class CondyleMotion:
         return means @ features, means @ slopes, self._off + uncertain @ features
 
     def strain(self, relative: Array) -> float:
-        """Return the squared Mahalanobis distance of the condyles from their predicted positions.
-
-        `relative` is T_upper_lower (4, 4).
-        """
+        """Return the squared Mahalanobis distance of the condyles at T_upper_lower (4, 4) from their prediction."""
         incisor, condyles = self._shifts(relative)
         mean, _, variance = self.expected(incisor)
         return float((np.square(condyles - mean) / variance).sum())
@@ -202,10 +199,7 @@ def strain_factors(motion: CondyleMotion, relative: Array, covariance: Array) ->
 
     The factor is the squared distance of the condyles from their prediction, relative to its usual value (Birge 1932).
 
-    Args:
-        motion: untrained condylar motion, which is trained in place.
-        relative: T_upper_lower, shape (F, 4, 4).
-        covariance: covariance of the left twists of T_upper_lower about the skull origin, shape (F, 6, 6).
+    `covariance` (F, 6, 6) is that of the left twists of T_upper_lower (F, 4, 4) about the skull origin.
     """
     for pose, spread in zip(relative, covariance, strict=True):
         motion.learn(pose, spread)
@@ -215,11 +209,7 @@ def strain_factors(motion: CondyleMotion, relative: Array, covariance: Array) ->
 
 
 def widen_strained(tracks: Tracks, landmarks: Array, axes: Array) -> Tracks:
-    """Return tracks in which the covariances of implausible frames are inflated; see `strain_factors`.
-
-    Args:
-        landmarks, axes: as in `CondyleMotion`.
-    """
+    """Return tracks with inflated covariances of implausible frames; see `strain_factors` and `CondyleMotion`."""
     relative, between = tracks.raw_T_upper_lower, tracks.covariance_relative
     known = np.asarray(np.isfinite(relative).all((1, 2)) & np.isfinite(between).all((1, 2)))
     if not known.any():
@@ -245,15 +235,7 @@ class CondyleFusion:
     least_mm: Array | None = None  # minimum standard deviations of the incisal point after the fusion [mm], shape (F,)
 
     def __call__(self, poses: Array, covariance: Array, between: Array) -> tuple[Array, Array, Array]:
-        """Return the fused poses and covariances; covariances of implausible frames are inflated first.
-
-        Frames with a lost arch are not changed.
-
-        Args:
-            poses: T_world_upper and T_world_lower, NaN where lost, shape (F, 2, 4, 4).
-            covariance: covariance of the poses' left twists about the world origin, shape (F, 2, 6, 6).
-            between: covariance of the left twist of T_upper_lower about the skull origin, shape (F, 6, 6).
-        """
+        """Return the fused poses and covariances, as in `results.Fusion`; frames with a lost arch are not changed."""
         poses, covariance, between = poses.copy(), covariance.copy(), between.copy()
         known = np.flatnonzero(np.isfinite(poses).all((1, 2, 3)) & np.isfinite(between).all((1, 2)))
         if not len(known):
@@ -289,11 +271,8 @@ def _fused(motion: CondyleMotion, relative: Array, covariance: Array) -> tuple[A
 def _shared(poses: Array, covariance: Array, twist: Array, gained: Array) -> tuple[Array, Array]:
     """Distribute a twist of T_upper_lower over both arches by their covariances; return new poses and covariances.
 
-    Args:
-        poses: T_world_upper and T_world_lower, shape (2, 4, 4).
-        covariance: covariance of the poses' left twists about the world origin, shape (2, 6, 6).
-        twist: left twist about the skull origin, shape (6,).
-        gained: reduction of the covariance of T_upper_lower's left twist by the fusion, shape (6, 6).
+    Poses (2, 4, 4) and covariances (2, 6, 6) are as in `results.Fusion`; the left twist (6,) is about the skull origin,
+    and `gained` (6, 6) is the reduction of its covariance by the fusion.
     """
     to_world = se3_adjoint(poses[0])
     gains = covariance @ np.linalg.inv(covariance.sum(0))  # the fusion adds `twist` to x_lower - x_upper

@@ -82,14 +82,7 @@ class PictureTake:
         axes: Array,
         shot: PictureShot,
     ) -> None:
-        """Prepare the scans.
-
-        Args:
-            jaw: the subject's rig.
-            scans: upper and lower teeth, prepared.
-            axes: rotation from scan to anatomical axes: left, up, front; shape (3, 3).
-            shot: images and frames.
-        """
+        """Prepare both scans; `axes` is the rotation from scan to anatomical axes: left, up, front; shape (3, 3)."""
         self._axes, self._jaw, self._shot = axes, jaw, shot
         self._scans = [thinned(scan, _LAST_FACES) for scan in scans]
         self.coordinates = Coordinates(jaw, self._scans)
@@ -100,20 +93,12 @@ class PictureTake:
         )
 
     def begun(self, frame: int, near: Pose) -> tuple[Pose, float]:
-        """Return the pose in a frame near a guess, and its `RigTracker.first_fit`, 0 .. 1.
-
-        Raises:
-            CaptureError: an image cannot be decoded.
-        """
+        """Return the pose in a frame near a guess, and its `RigTracker.first_fit`, 0 .. 1; errors as for `solve`."""
         tracker, fit = self._began(self._shot.cameras, 1.0, frame, near, searched=True)
         return fit.pose, tracker.first_fit
 
     def solve(self, frame: int, start: Pose, progress: Progress = lambda done, total: None) -> Performance:
-        """Solve head pose and jaw parameters of every frame.
-
-        Args:
-            frame, start: initial frame and pose.
-            progress: called after each frame with the number of frames done and the total.
+        """Solve head pose and jaw parameters of every frame, from an initial frame and pose.
 
         Raises:
             CaptureError: an image cannot be decoded.
@@ -187,9 +172,7 @@ class PictureTake:
     ) -> list[FrameFit]:
         """Return the fits of frames, tracked from an initial pose in both directions.
 
-        Args:
-            recover: whether to search for the teeth where they stay lost, and to leave out unconfirmed poses next to
-                lost frames.
+        If `recover`, teeth that stay lost are searched for, and unconfirmed poses next to lost frames are left out.
         """
 
         def search(lost: range, near: FrameFit) -> Begin[FrameFit]:
@@ -208,12 +191,7 @@ class PictureTake:
     def _again(
         self, cameras: Sequence[Camera], head: float, start: int, fits: Sequence[FrameFit], progress: Progress
     ) -> list[FrameFit]:
-        """Return the fits of all frames, aligned once more from the poses of smoothed fits.
-
-        Args:
-            start: frame in which the colours are learned.
-            fits: smoothed fits of all frames.
-        """
+        """Return the fits of all frames, aligned again from smoothed fits; colours are learned in frame `start`."""
         shot = self._shot
         smoothed, found = dict(zip(shot.frames, fits, strict=True)), dict[int, FrameFit]()
         tracker, begin = self._began(cameras, head, start, smoothed[start].pose)
@@ -280,16 +258,7 @@ class LiveTake:
         fixed_head: bool = False,
         executor: Executor | None = None,
     ) -> None:
-        """Prepare the scans for tracking.
-
-        Args:
-            jaw: the subject's rig.
-            scans: upper and lower teeth, prepared.
-            axes: rotation from scan to anatomical axes: left, up, front; shape (3, 3).
-            cameras: cameras in the order of the images.
-            fixed_head: whether the cameras are head-mounted, so that the head hardly moves relative to them.
-            executor: thread pool in which the contours of all cameras are matched in parallel.
-        """
+        """Prepare both scans; arguments are as for `PictureTake` and `PictureShot`, `executor` matches contours."""
         self._scans, self._axes, self._cameras = [thinned(scan, _LIVE_FACES) for scan in scans], axes, cameras
         self._head = STEADY if fixed_head else 1.0
         self.coordinates = Coordinates(jaw, self._scans)
@@ -297,7 +266,10 @@ class LiveTake:
         self._tracker: RigTracker | None = None
 
     def begin(self, cut: Cut, near: Pose) -> float:
-        """Learn the colours of a frame near a pose; return its `RigTracker.first_fit`, 0 .. 1."""
+        """Learn the colours of a frame near a pose; return its `RigTracker.first_fit`, 0 .. 1.
+
+        The other methods raise ValueError before.
+        """
         colours = LearnedColours(self._scans, self._cameras, self._axes)
         self._tracker = RigTracker(self._instants, colours, head=self._head, effort=FAST)
         self._tracker.begin(cut, near, searched=True)
@@ -309,31 +281,15 @@ class LiveTake:
         return self._tracker
 
     def step(self, cut: Cut, frames: float = 1.0) -> FrameFit:
-        """Align the images taken `frames` frames after the previous ones.
-
-        Raises:
-            ValueError: `begin` was not called.
-        """
+        """Align the images taken `frames` frames after the previous ones."""
         return self._begun("step").step(cut, frames)
 
     def carry(self, d: Array, covariance: Array) -> None:
-        """Replace d of a frame with hidden teeth, from which the next step starts.
-
-        Args:
-            d: jaw parameters [mm], shape (3,).
-            covariance: their covariance [mm^2], shape (3, 3).
-
-        Raises:
-            ValueError: `begin` was not called.
-        """
+        """Start the next step from d (3,) [mm] with covariance (3, 3) [mm^2], as after a frame with hidden teeth."""
         self._begun("carry").carry(d, np.diag(covariance) / VARIANCE_RATIO)
 
     def covariance_d(self, fit: FrameFit) -> Array:
-        """Return the covariance of the jaw parameters d in the last step [mm^2], including the rig error (3, 3).
-
-        Raises:
-            ValueError: `begin` was not called.
-        """
+        """Return the covariance of the jaw parameters d in the last step [mm^2], including the rig error (3, 3)."""
         precision, of_rig = np.diag(self._begun("covariance_d").expected.precision), np.zeros((3, 3))
         if fit.solution is not None and fit.found.any():
             weight = np.where(fit.found, 1.0 / (residual_px(fit.solution) ** 2 * CORRELATION_PX), 0.0)

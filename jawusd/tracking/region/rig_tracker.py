@@ -13,7 +13,7 @@ from jawusd.base.arrays import Array
 from jawusd.geometry import transform_point, transform_points
 from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.contour.equations import translation
-from jawusd.tracking.contour.quality import matched_px, score_px
+from jawusd.tracking.contour.quality import fitting_share, matched_px, score_px
 from jawusd.tracking.initialization.first_frame import FIRST_ROUNDS
 from jawusd.tracking.performance.attempts import LARGEST_SIGMA, FrameFit
 from jawusd.tracking.performance.coordinates import JAW, Pose
@@ -27,7 +27,6 @@ from jawusd.tracking.region.search import (
     AGAIN,
     LEAST_USUAL,
     USUAL_FRAMES,
-    fitting_share,
     head_shifts,
     rank_by_colour,
 )
@@ -94,8 +93,7 @@ class RigTracker:
     def begin(self, cut: Cut, pose: Pose, *, searched: bool = False) -> FrameFit:
         """Learn colours from a first frame near a pose; return the frame fit.
 
-        Args:
-            searched: whether the pose is the result of a search, so that one camera tries others if it hardly fits.
+        With one camera, other poses than one that was `searched` are tried if it hardly fits.
         """
         begun = self._begun(cut, pose, 1.0)
         alone = begun.look.use.any(axis=0).sum() == 1
@@ -124,11 +122,7 @@ class RigTracker:
         return [translation(sign * way) @ head for way in ways for sign in (-1.0, 1.0)]
 
     def _begun(self, cut: Cut, pose: Pose, jaw: float) -> Begun:
-        """Return a first frame aligned near a pose, with colours learned in it.
-
-        Args:
-            jaw: factor on the standard deviations of the jaw parameters.
-        """
+        """Return a first frame aligned near a pose, with colours learned in it; `jaw` scales the sigmas of d."""
         sigma = LARGEST_SIGMA * np.r_[[min(1.0, self._head)] * 6, [jaw] * 3]
         colours, arches = self._colours.copy(), self._coordinates.arches(pose)
         colours.begin(cut(arches), arches)
@@ -165,8 +159,7 @@ class RigTracker:
     def again(self, cut: Cut, fit: FrameFit) -> FrameFit:
         """Align the images of a frame once more from a pose that is better than the prediction, without a search.
 
-        Args:
-            fit: the pose; if an arch was not found in it, both arches must fit as well as after a loss.
+        If an arch was not found in the given fit, both arches must fit as well as after a loss.
         """
         look = self._look(cut, self._coordinates.arches(fit.pose))
         if not look.use.any():
@@ -191,9 +184,7 @@ class RigTracker:
     def _judged(self, look: InstantImages, rough: Aligned, found: Aligned, least: Array, otherwise: Pose) -> FrameFit:
         """Return the fit of a frame, and learn its colours and usual fit if both arches are found.
 
-        Args:
-            least: matched fraction of each arch above which it is found, shape (2,).
-            otherwise: the pose if neither arch is found.
+        An arch is found from the matched fraction `least` (2,) on; `otherwise` is the pose if neither is found.
         """
         usual = self._usual_share()
         share, fine = fitting_share(rough.solution), fitting_share(found.solution)

@@ -14,7 +14,7 @@ from jawusd.base.arrays import Array, Mask
 from jawusd.geometry import relative_pose, se3_exp, se3_inverse, transform_points
 from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.contour.equations import Solution, translation
-from jawusd.tracking.contour.quality import score_px
+from jawusd.tracking.contour.quality import fitting_share, score_px
 from jawusd.tracking.contour.rendering import Rendering
 from jawusd.tracking.contour.scan import Scan, thinned
 from jawusd.tracking.contour.solver import ContourSolver
@@ -102,9 +102,7 @@ def rank_by_colour(
 ) -> list[int]:
     """Return the indices of poses T_world_arch (4, 4), ranked by the tooth likelihood of the pixels at their crowns.
 
-    Args:
-        places: the poses to be ranked.
-        taken: for each view, the pixels (h, w) of the other arch, which are ignored; empty if unknown.
+    `taken` has, for each view, the pixels (h, w) of the other arch, which are ignored; empty if unknown.
     """
     points = scans[arch].crown_vertices(_POINTS)
     scores = np.zeros(len(places))
@@ -168,18 +166,12 @@ class PoseSearch:
     def near(self, start: Array, look: InstantViews, *, firm: bool = False) -> Solution:
         """Align from T_world_upper and T_world_lower (2, 4, 4) that are accurate to a few tenths of a millimetre.
 
-        Args:
-            firm: whether the condylar prior has a high weight, for uncertain frames.
+        If `firm`, for uncertain frames, the condylar prior has a high weight.
         """
         return self._align(start, look, FAR_GATES_PX, firm)
 
     def best(self, starts: list[Array], look: InstantViews, last: Array) -> Solution:
-        """Align from the prediction and, if the motion is fast, from other starts.
-
-        Args:
-            starts: poses, the prediction first.
-            last: poses of the previous frame.
-        """
+        """Align from the first start, the prediction, and if the motion from the `last` poses is fast, from others."""
         solution = self._align(starts[0], look, NEAR_GATES_PX)
         if np.abs(starts[0][:, :3, 3] - last[:, :3, 3]).max() > _FAST_MM:
             carried = solution.poses[0] @ se3_inverse(last[0]) @ last[1]
@@ -241,11 +233,7 @@ class PoseSearch:
         return self._better(solution, both) if fitting_share(both)[1] >= least else solution
 
     def look(self, views: Sequence[View], coarse_views: Callable[[], Sequence[View]]) -> InstantViews:
-        """Return the views of a frame with a shared rendering.
-
-        Args:
-            coarse_views: returns the views at the resolution of a search; called at most once.
-        """
+        """Return views with a shared rendering; `coarse_views`, called at most once, returns them as for a search."""
 
         @cache
         def coarse() -> tuple[Sequence[View], Rendering]:
@@ -260,10 +248,9 @@ class PoseSearch:
         return self.solver.solve(solution.poses, views, LAST_GATES_PX, None, terms, rendering=look.rendering)
 
     def objective_px(self, solution: Solution, px: float = 1.0) -> float:
-        """Return the objective: matched contour minus a penalty for implausible condyles [px].
+        """Return the matched contour minus a penalty for implausible condyles [px], in px of the usual resolution.
 
-        Args:
-            px: size of the pixels of the solution, in pixels of the usual resolution [-].
+        `px` is the size of the pixels of the solution in these px.
         """
         return px * float(score_px(solution).sum()) - _STRAIN_PX * self.condyles.strain(relative_pose(*solution.poses))
 
@@ -304,8 +291,3 @@ def fraction_in_sight(solution: Solution, views: Sequence[View]) -> Array:
     in_sight_px = np.sum([count.in_sight_px for count in counts if count is not None], axis=0)
     least_px = _LEAST_IN_SIGHT * solution.visible_px.sum(1)
     return np.asarray(score_px(solution).sum(1) / np.maximum(np.maximum(in_sight_px, least_px), 1.0), np.float64)
-
-
-def fitting_share(solution: Solution) -> Array:
-    """Return the matched fraction of the visible contour, per arch, shape (2,)."""
-    return np.asarray(score_px(solution).sum(1) / np.maximum(solution.visible_px.sum(1), 1.0), np.float64)

@@ -45,10 +45,7 @@ FOR_COLOURS = TrackingConfig(known_correlation_px=CORRELATION_PX)
 
 
 def camera_findings(names: Sequence[str], solutions: Iterable[Solution]) -> list[Finding]:
-    """Return a warning for each camera whose images fit the teeth far worse than those of the other cameras.
-
-    The finding's kind is "camera_rarely_used", its value the matched fraction of the visible contour.
-    """
+    """Return a warning "camera_rarely_used" [fraction of the visible contour] for each camera that fits far worse."""
     shares = []
     for solution in solutions:
         seen = solution.visible_px.sum(0)
@@ -82,9 +79,7 @@ def scan_findings(
 ) -> list[Finding]:
     """Return findings about scans and focal lengths from some frames; see `lens_findings` and `mirror_findings`.
 
-    Args:
-        left: unit vector in scan coordinates, shape (3,).
-        looks: for each frame, T_world_upper and T_world_lower (2, 4, 4), and its views, one per camera.
+    `left` is a unit vector in scan coordinates (3,); `looks` has the poses (2, 4, 4) and views of each frame.
     """
 
     def shown(views: Sequence[View]) -> Mask:
@@ -108,10 +103,7 @@ def _longest_run(good: NDArray[np.bool_]) -> tuple[int, int]:
 
 
 def footage_findings(tracks: Tracks) -> list[Finding]:
-    """Return a warning if the jaw is lost, or its position uncertain by more than 1 mm, in too many frames.
-
-    The finding's kind is "footage_doubtful".
-    """
+    """Return a warning "footage_doubtful" [%] if the jaw is lost or uncertain by over 1 mm in too many frames."""
     sigma_mm = tracks.sigma_mm[:, :3].mean(1)
     bad = ~(sigma_mm <= _UNKNOWN_MM)  # also true for NaN, where an arch is lost
     share = float(bad.mean())
@@ -147,10 +139,7 @@ class TakeFacts:
 def tracks_of(
     followed: Mapping[int, RegionPose], take: TakeFacts, looks: Sequence[tuple[Array, Sequence[View]]] = ()
 ) -> Tracks:
-    """Return the tracks of the given frames; delays between cameras and border offsets are estimated as well.
-
-    Args:
-        looks: poses and views of some frames, for estimating scale and focal lengths.
+    """Return the tracks of frames with estimated delays and border offsets; `looks` are as in `scan_findings`.
 
     Raises:
         TrackingError: the registration of the scans is to be corrected, but the teeth are never closed.

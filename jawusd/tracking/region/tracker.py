@@ -14,6 +14,7 @@ from jawusd.base.arrays import Array, Mask
 from jawusd.geometry import Camera, relative_pose
 from jawusd.tracking.contour.equations import Solution
 from jawusd.tracking.contour.quality import (
+    fitting_share,
     matched_px,
     relative_covariance,
     residual_px,
@@ -31,7 +32,6 @@ from jawusd.tracking.region.search import (
     USUAL_FRAMES,
     InstantViews,
     PoseSearch,
-    fitting_share,
     fraction_in_sight,
 )
 from jawusd.tracking.sequence.history import MotionPredictor
@@ -93,13 +93,7 @@ class RegionTracker:
         axes: Array,
         executor: Executor | None = None,
     ) -> None:
-        """Prepare the scans.
-
-        Args:
-            scans: upper and lower scan, in one coordinate frame, in occlusion.
-            cameras: cameras in the order of the images.
-            landmarks, axes: as in `CondyleMotion`.
-        """
+        """Prepare both scans, in one frame and in occlusion; `landmarks` and `axes` are as in `CondyleMotion`."""
         self._search = PoseSearch(scans, landmarks, axes, executor)
         self._colours = self._latest = LearnedColours(scans, cameras, axes)
         self._first_share, self.first_fit = np.zeros(2), 0.0
@@ -119,12 +113,7 @@ class RegionTracker:
         return RegionPose(poses, np.ones(2, bool), _covariance(solution), objective_px, solution)
 
     def views(self, pictures: Sequence[Picture | None], poses: Array) -> list[View]:
-        """Return the views of a frame, with the colours of the last frame that was followed.
-
-        Args:
-            pictures: one image per camera.
-            poses: T_world_upper and T_world_lower in that frame, shape (2, 4, 4).
-        """
+        """Return the views of a frame with poses (2, 4, 4), with the colours of the last frame that was followed."""
         return self._latest.views(pictures, poses)
 
     def follow(self, cuts: Iterator[Cut], poses: Array) -> Iterator[RegionPose]:

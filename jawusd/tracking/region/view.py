@@ -75,11 +75,8 @@ def choose_tables(
 def measure_blur(samples: Array, before: Array, shutter: float, out: Array) -> None:
     """Write the motion of contour samples along their normals during the exposure [px], shape (n,).
 
-    Args:
-        samples: shape (n, COLUMNS).
-        before: projection of the arch into this camera's image in the previous frame, shape (3, 4).
-        shutter: exposure as a fraction of the frame time [-].
-        out: result, shape (n,).
+    `before` (3, 4) projects the arch into this camera's image in the previous frame; `shutter` is the exposure as a
+    fraction of the frame time.
     """
     for s in range(len(samples)):
         sample = samples[s]

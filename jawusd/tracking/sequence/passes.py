@@ -14,7 +14,7 @@ from jawusd.formats.tracks import LOST, RECOVERED, TRACKED, LostReason
 from jawusd.geometry import relative_pose, transform_points
 from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.contour.frame_record import FrameRecord, Loss, PackedRecords
-from jawusd.tracking.contour.quality import residual_px, score_px
+from jawusd.tracking.contour.quality import fitting_share, residual_px, score_px
 from jawusd.tracking.contour.scan import ARCHES, probe_points
 from jawusd.tracking.contour.solver import ContourSolver
 from jawusd.tracking.contour.views import MaskViews, View
@@ -243,13 +243,10 @@ def mark_poorly_seen_lost(records: MutableMapping[int, FrameRecord]) -> None:
     """Mark arches as lost in frames in which they match far less contour than usual, with far larger residuals."""
     frames = sorted(records)
     kept = np.array([records[frame].found for frame in frames])
-    share, residual = (np.full((len(frames), 2), np.nan) for _ in range(2))
-    for k, frame in enumerate(frames):
-        solution = records[frame].solution
-        share[k] = score_px(solution).sum(1) / np.maximum(solution.visible_px.sum(1), 1.0)
-        residual[k] = residual_px(solution)
     if (kept.sum(0) < _TELLING_FRAMES).any():
         return
+    solutions = (records[frame].solution for frame in frames)
+    share, residual = np.array([(fitting_share(own), residual_px(own)) for own in solutions]).swapaxes(0, 1)
     usual = [[float(np.nanmedian(values[kept[:, r], r])) for r in ARCHES] for values in (share, residual)]
     relative = share / np.array(usual[0])
     poor = kept & (relative < _POOR_SHARE) & (residual > _POOR_RESIDUAL * np.array(usual[1]))

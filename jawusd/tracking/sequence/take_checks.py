@@ -15,7 +15,7 @@ from jawusd.formats.finding import Finding
 from jawusd.formats.tracks import LOST
 from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.contour.frame_record import FrameRecord, whole_frames
-from jawusd.tracking.contour.quality import residual_px, score_px
+from jawusd.tracking.contour.quality import fitting_share, residual_px, score_px
 from jawusd.tracking.contour.scan import ARCH_NAMES, Scan, mirrored
 from jawusd.tracking.contour.solver import ContourSolver
 from jawusd.tracking.initialization.bootstrap import SIZE_HINT, than
@@ -151,8 +151,10 @@ def misfit_findings(records: Mapping[int, FrameRecord]) -> list[Finding]:
     whole = [records[frame].solution for frame in whole_frames(records)]
     if len(whole) < _TELLING_FRAMES:
         return []
-    shares = [score_px(s).sum(1) / np.maximum(s.visible_px.sum(1), 1.0) for s in whole]
-    share, rough = np.median(shares, axis=0), np.nanmedian([residual_px(s) for s in whole], axis=0)
+    share, rough = (
+        np.median([fitting_share(s) for s in whole], axis=0),
+        np.nanmedian([residual_px(s) for s in whole], axis=0),
+    )
     out = []
     for r, other in ((0, 1), (1, 0)):
         if share[r] < _FITS_LESS * share[other] and rough[r] > _FITS_ROUGHER * rough[other]:
