@@ -18,7 +18,7 @@ from jawusd.geometry.camera import intrinsics
 from jawusd.photographs.drawing import Crowns, Drawing, Outlines, draw_teeth, features, outlines_of
 from jawusd.tracking.contour.equations import motion_about
 from jawusd.tracking.contour.scan import Scan
-from jawusd.tracking.initialization.occlusion import crown_surface
+from jawusd.tracking.initialization.occlusion import crown_surface, signed_distances
 
 #: Number of unknowns of a photograph: twist of the upper teeth about their centre [rad, mm], log focal length,
 #: distortion. A step in focal length also changes the distance so that the teeth keep their size in the image, which
@@ -137,15 +137,10 @@ class Contact:
 
     def _signed(self, points: Array) -> tuple[Array, Array]:
         """Return signed distances of points from the upper crowns [mm], negative inside, (N,), and normals (N, 3)."""
-        distance, index = self._tree.query(points)
-        normals = self._upper.normals[index]
-        off = points - self._upper.points[index]
-        behind = np.einsum("ij,ij->i", off, normals)
-        inside = (behind < -0.7 * distance) & (distance < _REACH_MM) & ~self._upper.border[index]
+        signed, behind, index = signed_distances(points, self._upper, self._tree, _REACH_MM)
         # Near the surface, the distance from the tangent plane is more accurate than the distance from the nearest
         # point.
-        away = np.where(distance < 1.0, behind, np.where(inside, -distance, distance))
-        return away, normals
+        return np.where(np.abs(signed) < 1.0, behind, signed), self._upper.normals[index]
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from jawusd.base.arrays import Array, Mask
@@ -76,7 +77,8 @@ def measure_occlusion(scans: Sequence[Scan], T_anatomical_scan: Array) -> Occlus
     middle = float(np.mean([np.percentile(points[:, 0], [1, 99]).mean() for points in (upper, lower)]))
     # Distances are computed in both directions: samples of the finer surface find contacts that those of the coarser
     # one miss.
-    signed = [_signed_distances(surfaces[k], surfaces[1 - k]) for k in (0, 1)]
+    others = [(surface, cKDTree(surface.points), _DEEPEST_MM) for surface in surfaces[::-1]]
+    signed = [signed_distances(own.points, *other)[0] for own, other in zip(surfaces, others, strict=True)]
     nearest = [_weighted_quantile(d, surfaces[k].areas, _SHARE) for k, d in enumerate(signed)]
     stand = [_beside(a, b) for a, b in ((upper, lower), (lower, upper))]
     deep = sum(float(surfaces[k].areas[d < -_DEEP_MM].sum()) for k, d in enumerate(signed))
@@ -112,13 +114,19 @@ def crown_surface(scan: Scan) -> CrownSurface:
     return CrownSurface(corners.mean(1), directed / np.maximum(areas, 1e-12)[:, None], areas, border[chosen])
 
 
-def _signed_distances(these: CrownSurface, others: CrownSurface) -> Array:
-    """Return the distance of each sample to the other arch, negative inside [mm], shape (N,)."""
-    distance, nearest = cKDTree(others.points).query(these.points)
-    behind = np.einsum("ij,ij->i", these.points - others.points[nearest], others.normals[nearest])
+def signed_distances(
+    points: Array, surface: CrownSurface, tree: cKDTree, deepest_mm: float
+) -> tuple[Array, Array, NDArray[np.int64]]:
+    """Return distances of points (N, 3) from a surface and from its tangent planes, negative inside [mm], and samples.
+
+    `tree` has the points of the surface; those that seem deeper inside than `deepest_mm` lie beyond its border. The
+    last result is the index of the nearest sample of the surface.
+    """
+    distance, nearest = tree.query(points)
+    behind = np.einsum("ij,ij->i", points - surface.points[nearest], surface.normals[nearest])
     # Points are inside if they lie behind the surface, and not merely beyond its border.
-    inside = (behind < -0.7 * distance) & (distance < _DEEPEST_MM) & ~others.border[nearest]
-    return np.where(inside, -distance, distance)
+    inside = (behind < -0.7 * distance) & (distance < deepest_mm) & ~surface.border[nearest]
+    return np.where(inside, -distance, distance), behind, nearest
 
 
 def _through(upper: Array, lower: Array) -> float:
