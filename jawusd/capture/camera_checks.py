@@ -12,7 +12,7 @@ from itertools import combinations
 import numpy as np
 
 from jawusd.base.arrays import Array
-from jawusd.formats.finding import Finding
+from jawusd.formats.finding import Finding, Severity
 from jawusd.geometry import Camera, triangulate
 
 # Plausible range of the ratio of focal length to image width; fields of view from 100 down to 3 degrees.
@@ -34,18 +34,13 @@ def camera_findings(cameras: Sequence[Camera], path: str) -> Iterator[Finding]:
     baselines = [float(np.linalg.norm(a.centre_world() - b.centre_world())) for a, b in pairs]
     for (a, b), baseline in zip(pairs, baselines, strict=True):
         if not _LEAST_BASELINE_MM <= baseline <= _MOST_BASELINE_MM:
-            unit = " Is the calibration in metres?" if max(baselines) < _LEAST_BASELINE_MM else ""
-            yield Finding(
-                "cameras_together" if baseline < _LEAST_BASELINE_MM else "cameras_far_apart",
-                "error" if max(baselines) < _LEAST_BASELINE_MM else "warning",
-                f"this camera is {baseline:.4g} mm away from camera {a.name}; the usual range is "
-                f"{_LEAST_BASELINE_MM:g} to {_MOST_BASELINE_MM:g} mm.{unit}",
-                baseline,
-                _LEAST_BASELINE_MM,
-                path=path,
-                camera=b.name,
-                hint="Set calibration_unit_mm to the length unit of the file, or calibrate again.",
-            )
+            kind = "cameras_together" if baseline < _LEAST_BASELINE_MM else "cameras_far_apart"
+            severity: Severity = "error" if max(baselines) < _LEAST_BASELINE_MM else "warning"
+            message = f"this camera is {baseline:.4g} mm away from camera {a.name}; the usual range is "
+            message += f"{_LEAST_BASELINE_MM:g} to {_MOST_BASELINE_MM:g} mm."
+            message += " Is the calibration in metres?" if severity == "error" else ""
+            hint = "Set calibration_unit_mm to the length unit of the file, or calibrate again."
+            yield Finding(kind, severity, message, baseline, _LEAST_BASELINE_MM, path=path, camera=b.name, hint=hint)
     if max(baselines) >= _LEAST_BASELINE_MM:
         yield from _aim_findings(cameras, path)
 
@@ -98,30 +93,19 @@ def _aim_findings(cameras: Sequence[Camera], path: str) -> Iterator[Finding]:
     for camera in cameras:
         depth = float(camera.depth(target))
         if not _NEAREST_MM <= depth <= _FARTHEST_MM:
+            message = f"the common target of the cameras is {depth:.0f} mm in front of this camera; the usual range is "
+            message += f"{_NEAREST_MM:g} to {_FARTHEST_MM:g} mm"
+            hint = "Check the pose of this camera in the calibration, and calibration_unit_mm."
             yield Finding(
-                "camera_aim",
-                "warning",
-                f"the common target of the cameras is {depth:.0f} mm in front of this camera; the usual range is "
-                f"{_NEAREST_MM:g} to {_FARTHEST_MM:g} mm",
-                depth,
-                _NEAREST_MM,
-                path=path,
-                camera=camera.name,
-                hint="Check the pose of this camera in the calibration, and calibration_unit_mm.",
+                "camera_aim", "warning", message, depth, _NEAREST_MM, path=path, camera=camera.name, hint=hint
             )
     views = [(target - camera.centre_world()) / np.linalg.norm(target - camera.centre_world()) for camera in cameras]
     angles = [float(np.degrees(np.arccos(np.clip(a @ b, -1.0, 1.0)))) for a, b in combinations(views, 2)]
     if max(angles) < _LEAST_ANGLE_DEG:
-        yield Finding(
-            "views_alike",
-            "warning",
-            f"all viewing directions lie within {max(angles):.1f} degrees; expected at least "
-            f"{_LEAST_ANGLE_DEG:g} degrees",
-            max(angles),
-            _LEAST_ANGLE_DEG,
-            path=path,
-            hint="Check the calibration, or place the cameras farther apart.",
-        )
+        message = f"all viewing directions lie within {max(angles):.1f} degrees; expected at least "
+        message += f"{_LEAST_ANGLE_DEG:g} degrees"
+        hint = "Check the calibration, or place the cameras farther apart."
+        yield Finding("views_alike", "warning", message, max(angles), _LEAST_ANGLE_DEG, path=path, hint=hint)
 
 
 def common_target(cameras: Sequence[Camera]) -> Array:
@@ -152,10 +136,7 @@ def swapped_cameras(
 ) -> list[tuple[str, str]]:
     """Return pairs of cameras whose masks start and end with the take only if they are swapped.
 
-    Args:
-        ranges: first and last frame with masks, by camera.
-        offsets: frame number of the reference camera minus that of the camera at the same time, by camera.
-        first, stop: range of the take, in frame numbers of the reference camera.
+    Offsets by camera are frame numbers of the reference camera, in which the take is given, minus those of the camera.
     """
 
     def fits(source: str, camera: str) -> bool:
@@ -187,16 +168,10 @@ def centre_findings(cameras: Mapping[str, Camera], centres: Sequence[Sequence[Ma
     worst = max(blame, key=lambda name: (blame[name], sum(mm for pair, mm in wrong.items() if name in pair)))
     pair, mm = max(((p, mm) for p, mm in wrong.items() if worst in p), key=lambda item: item[1])
     other = pair[0] if pair[1] == worst else pair[1]
-    yield Finding(
-        "cameras_contradict",
-        "warning",
-        f"its rays through the centre of the teeth miss those of camera {other} by {mm:.0f} mm; a distance "
-        f"of at most {_RAYS_MM:g} mm is plausible",
-        mm,
-        _RAYS_MM,
-        camera=worst,
-        hint="Check that masks, video and calibration belong to this camera, and check the time offsets.",
-    )
+    message = f"its rays through the centre of the teeth miss those of camera {other} by {mm:.0f} mm; a distance "
+    message += f"of at most {_RAYS_MM:g} mm is plausible"
+    hint = "Check that masks, video and calibration belong to this camera, and check the time offsets."
+    yield Finding("cameras_contradict", "warning", message, mm, _RAYS_MM, camera=worst, hint=hint)
 
 
 def width_findings(cameras: Mapping[str, Camera], pixels: Mapping[str, Array]) -> Iterator[Finding]:
@@ -217,15 +192,10 @@ def width_findings(cameras: Mapping[str, Camera], pixels: Mapping[str, Array]) -
         widths.append(float(np.linalg.norm(high - low) * camera.depth(place) / camera.K[0, 0]))
     width = float(np.median(widths))
     if not _SEEN_MM[0] <= width <= _SEEN_MM[1]:
-        yield Finding(
-            "teeth_size",
-            "warning",
-            f"with this calibration, the teeth in the masks are {width:.3g} mm wide; a width of "
-            f"{_SEEN_MM[0]:g} to {_SEEN_MM[1]:g} mm is plausible",
-            width,
-            _SEEN_MM[width > _SEEN_MM[1]],
-            hint="Check calibration_unit_mm, the board's square size, and that the masks belong to this calibration.",
-        )
+        message = f"with this calibration, the teeth in the masks are {width:.3g} mm wide; a width of "
+        message += f"{_SEEN_MM[0]:g} to {_SEEN_MM[1]:g} mm is plausible"
+        hint = "Check calibration_unit_mm, the board's square size, and that the masks belong to this calibration."
+        yield Finding("teeth_size", "warning", message, width, _SEEN_MM[width > _SEEN_MM[1]], hint=hint)
 
 
 def _rays_mm(cameras: Mapping[str, Camera], pair: tuple[str, str], found: Mapping[str, Array]) -> float:

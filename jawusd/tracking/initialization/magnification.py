@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jawusd.base.arrays import Array, Mask
-from jawusd.geometry import transform_point, transform_points
+from jawusd.geometry import Camera, transform_point, transform_points
 from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.contour.correspondences import search_edges
 from jawusd.tracking.contour.samples import HABITS, LENGTH, NX, NY, U, V, X, Z, contour_samples
@@ -191,6 +191,13 @@ def magnified(view: View, factor: float) -> View:
     grow = np.diag([factor, factor, 1.0])
     grow[:2, 2] = (1.0 - factor) * principal_point(view.matrix)
     return replace(view, matrix=grow @ view.matrix)
+
+
+def zoomed(camera: Camera, factor: float) -> Camera:
+    """Return a camera with its focal length multiplied by a factor."""
+    K = camera.K.copy()
+    K[[0, 1], [0, 1]] *= factor
+    return replace(camera, K=K)
 
 
 def principal_point(matrix: Array) -> Array:

@@ -16,6 +16,7 @@ from jawusd.base.arrays import Array
 from jawusd.formats.capture import Pick
 from jawusd.geometry import Camera, se3_exp, transform_points
 from jawusd.tracking.initialization.bootstrap import SIZE_HINT, exchanged, picked_size, placed, than, with_cameras
+from jawusd.tracking.initialization.magnification import zoomed
 
 _SIZE_SHARE = 0.02  # minimum relative error of the scan size, estimated from the picks, for it to be a possible mistake
 # Prior standard deviations of a camera's errors: shift as a fraction of the image width, and relative focal length; and
@@ -52,74 +53,45 @@ class Mistake:
 
 def possible_mistakes(given: Setting) -> Iterator[Mistake]:
     """Yield every mistake that can be corrected; those of single cameras take longest and come last."""
-    yield Mistake(
-        "scans_mirrored",
-        "the scans are mirrored: left and right are exchanged",
-        "Export them again without mirroring; one axis may have been negated.",
-        _with_scans(given, np.array([-1.0, 1.0, 1.0])),
-    )
+    message = "the scans are mirrored: left and right are exchanged"
+    hint = "Export them again without mirroring; one axis may have been negated."
+    yield Mistake("scans_mirrored", message, hint, _with_scans(given, np.array([-1.0, 1.0, 1.0])))
     vertices = given.vertices[::-1]
     if all(pick.vertex < len(own) for own, picks in zip(vertices, given.picks, strict=True) for pick in picks):
-        yield Mistake(
-            "scans_exchanged",
-            "upper_teeth and lower_teeth in [scans] are exchanged",
-            "Exchange the names of these files.",
-            replace(given, vertices=vertices, crowns=given.crowns[::-1]),
-        )
+        message, hint = "upper_teeth and lower_teeth in [scans] are exchanged", "Exchange the names of these files."
+        yield Mistake("scans_exchanged", message, hint, replace(given, vertices=vertices, crowns=given.crowns[::-1]))
     yield from _exchanges(given)
     size, _ = picked_size(given.picks, given.vertices, given.cameras)
     if abs(size - 1.0) > _SIZE_SHARE:
-        yield Mistake(
-            "scan_size",
-            f"the picks show teeth {than(1.0 / size - 1.0)} than the scans: the scale of the scans or of the "
-            "calibration is wrong",
-            SIZE_HINT,
-            _with_scans(given, np.full(3, 1.0 / size)),
-            True,
-        )
+        message = f"the picks show teeth {than(1.0 / size - 1.0)} than the scans: the scale of the scans or of the "
+        message += "calibration is wrong"
+        yield Mistake("scan_size", message, SIZE_HINT, _with_scans(given, np.full(3, 1.0 / size)), True)
     yield from _wrong_lenses(given)
 
 
 def _exchanges(given: Setting) -> Iterator[Mistake]:
     """Yield swaps of calibrations, of cameras in the picks, and of masks."""
+    message = "the two cameras of the picks are exchanged"
+    hint = "Exchange the camera names within every pick of [bootstrap]."
     upper, lower = (with_cameras(picks, lambda names: names[::-1]) for picks in given.picks)
-    yield Mistake(
-        "picks_views_exchanged",
-        "the two cameras of the picks are exchanged",
-        "Exchange the camera names within every pick of [bootstrap].",
-        replace(given, picks=(upper, lower)),
-    )
+    yield Mistake("picks_views_exchanged", message, hint, replace(given, picks=(upper, lower)))
     for a, b in combinations(given.cameras, 2):
-        other = {a: b, b: a}
-        yield Mistake(
-            "calibrations_exchanged",
-            f"the calibrations of cameras {a} and {b} are exchanged",
-            f"Exchange the names {a} and {b} in the calibration.",
-            replace(given, cameras={name: given.cameras[other.get(name, name)] for name in given.cameras}),
-        )
-        yield Mistake(
-            "picks_cameras_exchanged",
-            f"cameras {a} and {b} are exchanged in the picks",
-            "Exchange these names in [bootstrap].",
-            replace(given, picks=(exchanged(given.picks[0], a, b), exchanged(given.picks[1], a, b))),
-        )
-        yield Mistake(
-            "masks_cameras_exchanged",
-            f"the masks of cameras {a} and {b} are exchanged",
-            f"Exchange the masks of cameras {a} and {b}.",
-            replace(given, sources=other),
-        )
-    hint = "Exchange masks.upper and masks.lower"
+        both, other = f"cameras {a} and {b}", {a: b, b: a}
+        message = f"the calibrations of {both} are exchanged"
+        hint = f"Exchange the names {a} and {b} in the calibration."
+        cameras = {name: given.cameras[other.get(name, name)] for name in given.cameras}
+        yield Mistake("calibrations_exchanged", message, hint, replace(given, cameras=cameras))
+        message, hint = f"{both} are exchanged in the picks", "Exchange these names in [bootstrap]."
+        upper, lower = (exchanged(picks, a, b) for picks in given.picks)
+        yield Mistake("picks_cameras_exchanged", message, hint, replace(given, picks=(upper, lower)))
+        message, hint = f"the masks of {both} are exchanged", f"Exchange the masks of {both}."
+        yield Mistake("masks_cameras_exchanged", message, hint, replace(given, sources=other))
+    message, hint = "the masks of the upper and lower teeth are exchanged in", "Exchange masks.upper and masks.lower"
     for name in given.cameras:
-        message = f"the masks of the upper and lower teeth are exchanged in camera {name}"
         swapped = replace(given, exchanged=frozenset([name]))
-        yield Mistake("masks_arches_exchanged", message, f"{hint} of camera {name}.", swapped)
-    yield Mistake(
-        "masks_arches_exchanged",
-        "the masks of the upper and lower teeth are exchanged in every camera",
-        f"{hint}, or upper_teeth and lower_teeth in [scans] and the picks.",
-        replace(given, exchanged=frozenset(given.cameras)),
-    )
+        yield Mistake("masks_arches_exchanged", f"{message} camera {name}", f"{hint} of camera {name}.", swapped)
+    message, hint = f"{message} every camera", f"{hint}, or upper_teeth and lower_teeth in [scans] and the picks."
+    yield Mistake("masks_arches_exchanged", message, hint, replace(given, exchanged=frozenset(given.cameras)))
 
 
 def _with_scans(given: Setting, factors: Array) -> Setting:
@@ -152,13 +124,6 @@ def shifted(camera: Camera, shift_px: Array) -> Camera:
     """Return a camera with its principal point moved by `shift_px` (2,)."""
     K = camera.K.copy()
     K[:2, 2] += shift_px
-    return replace(camera, K=K)
-
-
-def zoomed(camera: Camera, factor: float) -> Camera:
-    """Return a camera with its focal length multiplied by a factor."""
-    K = camera.K.copy()
-    K[[0, 1], [0, 1]] *= factor
     return replace(camera, K=K)
 
 

@@ -18,6 +18,7 @@ from jawusd.tracking.contour.quality import residual_px, score_px
 from jawusd.tracking.contour.scan import Scan, teeth_centre, thinned
 from jawusd.tracking.contour.solver import ContourSolver
 from jawusd.tracking.follow import Begin, TwoWays, both_ways
+from jawusd.tracking.initialization.magnification import zoomed
 from jawusd.tracking.performance.attempts import FrameFit
 from jawusd.tracking.performance.coordinates import JAW, Coordinates, Pose
 from jawusd.tracking.performance.instant import InstantSolver, rig_gain
@@ -26,9 +27,8 @@ from jawusd.tracking.performance.results import performance_of
 from jawusd.tracking.performance.skin import SkinOf, jaw_of_skin
 from jawusd.tracking.performance.smoother import VARIANCE_RATIO, Smoothed, Smoother, with_one_head
 from jawusd.tracking.region.appearance import CORRELATION_PX, Cut, LearnedColours
-from jawusd.tracking.region.effort import FAST
 from jawusd.tracking.region.rig_tracker import FOR_RIGS, RigTracker
-from jawusd.tracking.region.search import FACES, REDRAW_PX, SAMPLE_STEP_PX
+from jawusd.tracking.region.search import FACES, FAST, REDRAW_PX, SAMPLE_STEP_PX
 
 #: Function that returns the cropped images of a range of frames. Arguments: cameras, possibly with changed focal
 #: lengths; a world point near the teeth, which determines the resolution [mm], shape (3,); and the frames.
@@ -136,7 +136,7 @@ class PictureTake:
                 smoothed = self._smoothed(some, fits)
                 fits, growth = smoothed.fits, np.exp(smoothed.state.log_focal)
                 factors = factors * growth
-                cameras = [_zoomed(camera, float(f)) for camera, f in zip(cameras, growth, strict=True)]
+                cameras = [zoomed(camera, float(f)) for camera, f in zip(cameras, growth, strict=True)]
             start = fits[some.index(at)].pose
         return cameras, start, factors
 
@@ -230,13 +230,6 @@ def _parameters(smoothed: Smoothed) -> Array:
 
 def _fitting_px(fit: FrameFit) -> float:
     return 0.0 if fit.solution is None else float(score_px(fit.solution).sum())
-
-
-def _zoomed(camera: Camera, factor: float) -> Camera:
-    """Return a camera with its focal length multiplied by a factor."""
-    K = camera.K.copy()
-    K[[0, 1], [0, 1]] *= factor
-    return replace(camera, K=K)
 
 
 # Number of crown faces and settings, which are coarser than for recorded images, since dropped frames reduce accuracy
