@@ -34,7 +34,7 @@ from jawusd.tracking.performance.skin import SkinOf
 from jawusd.tracking.region.appearance import Cut, Picture
 from jawusd.tracking.region.performance import PictureShot, PictureTake
 from jawusd.tracking.region.picture_start import ArchStart, PictureStart
-from jawusd.tracking.region.take import TakeFacts, footage_findings, tracks_of
+from jawusd.tracking.region.take import footage_findings, tracks_of
 from jawusd.tracking.region.tracker import RegionPose, RegionTracker
 
 _WORKING_PX_PER_MM, _MARGIN_MM = 7.2, 6.0  # resolution at the teeth, and margin around them, in cropped images
@@ -196,15 +196,16 @@ def track_videos(
         else:
             begin = search.picked(capture.bootstrap, frames)
         followed = follower.run(frames, search, progress)
-    facts = TakeFacts(
+    tracks = tracks_of(
+        followed,
         tuple(cameras.values()),
         scans,
         subject.landmarks,
         subject.T_anatomical_skull[:3, :3],
-        capture.motion.rest_frame,
-        capture.scans.registration == "take",
+        follower.sampled_views,
+        rest_frame=capture.motion.rest_frame,
+        registers=capture.scans.registration == "take",
     )
-    tracks = tracks_of(followed, facts, follower.sampled_views)
     tracks.meta["start"] = {"by": begin.by, "frame": begin.frame, "fit": begin.fit}
     findings = [finding.as_json() for finding in (*rows.findings, *footage_findings(tracks))]
     tracks.meta["findings"] = [*tracks.meta.get("findings", []), *findings]

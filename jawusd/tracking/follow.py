@@ -239,9 +239,14 @@ def gained(pose: Located, other: Located) -> bool:
 
 def lost_stretches(known: Mapping[int, P], frames: range, shortest: int = _SHORTEST_LOSS) -> list[range]:
     """Return the runs of successive frames on which an arch was not found, except very short ones."""
-    found = np.array([known[frame].found.all() for frame in frames])
-    edges = np.flatnonzero(np.diff(np.concatenate([[True], found, [True]]).astype(int))).reshape(-1, 2).tolist()
-    return [frames[first:stop] for first, stop in edges if stop - first >= shortest]
+    lost = np.array([not known[frame].found.all() for frame in frames])
+    return [frames[first:stop] for first, stop in true_runs(lost) if stop - first >= shortest]
+
+
+def true_runs(mask: Mask) -> list[tuple[int, int]]:
+    """Return the first index of every run of true values, shape (N,), and the index after its last one."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
+    return [(first, stop) for first, stop in edges.reshape(-1, 2).tolist()]
 
 
 def nearest_found(known: Mapping[int, P], lost: range) -> P:

@@ -22,9 +22,8 @@ from jawusd.tracking.contour.scan import prepare_scan
 from jawusd.tracking.performance.coordinates import Pose
 from jawusd.tracking.region import rig_tracker
 from jawusd.tracking.region import tracker as region_tracker
-from jawusd.tracking.region.effort import THOROUGH
 from jawusd.tracking.region.rig_tracker import RigTracker
-from jawusd.tracking.region.search import InstantViews, PoseSearch
+from jawusd.tracking.region.search import THOROUGH, PoseSearch
 from jawusd.tracking.sequence.guided import GuidedTracker
 from jawusd.tracking.sequence.history import MotionPredictor
 
@@ -228,7 +227,7 @@ def test_a_jaw_counts_again_after_its_head_was_aligned_alone(monkeypatch, both_p
     search = PoseSearch.__new__(PoseSearch)
     search.condyles = SimpleNamespace(strain=lambda relative: 0.0)
     monkeypatch.setattr(search, "near", lambda *_, firm: solution_that_fits(*both_px))
-    found = search.with_jaw(solution_that_fits(61.0, 0.0), InstantViews([], None, None), least)
+    found = search.with_jaw(solution_that_fits(61.0, 0.0), None, least)
     np.testing.assert_array_equal(score_px(found)[:, 0], fitting_px)
 
 
@@ -236,14 +235,17 @@ def test_a_jaw_counts_again_after_its_head_was_aligned_alone(monkeypatch, both_p
 def test_a_lost_jaw_that_fits_a_little_is_the_start_for_the_next_frame(monkeypatch, fits, kept):
     start, better = (np.stack([np.eye(4), translation(np.array([0.0, down, 0.0]))]) for down in (0.0, -3.0))
     one_way = region_tracker._DirectionTracker.__new__(region_tracker._DirectionTracker)
-    one_way._search = SimpleNamespace(config=SimpleNamespace(least_matched_px=0.0), objective_px=lambda solution: 0.0)
+    one_way._search = SimpleNamespace(
+        config=SimpleNamespace(least_matched_px=0.0),
+        objective_px=lambda solution: 0.0,
+        polished=lambda *_, **__: SimpleNamespace(poses=better),
+    )
     one_way._motion = MotionPredictor(start, np.zeros((2, 1, 3)))
     one_way._found = np.array([True, False])
     monkeypatch.setattr(region_tracker, "fitting_share", lambda solution: np.array(fits))
     monkeypatch.setattr(region_tracker, "matched_px", lambda solution: np.full(2, 100.0))
     monkeypatch.setattr(region_tracker, "_covariance", lambda solution: np.zeros((2, 6, 6)))
-    instant = SimpleNamespace(polished=lambda *_, **__: SimpleNamespace(poses=better))
-    given = one_way._taken(instant, None, True, np.full(2, 0.3), True)
+    given = one_way._taken(None, None, True, np.full(2, 0.3), True)
     assert not given.found[1]
     np.testing.assert_allclose(one_way._motion.starts()[0][1], (better if kept else start)[1], atol=1e-12)
 

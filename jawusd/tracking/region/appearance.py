@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from copy import copy, deepcopy
 from dataclasses import replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -15,7 +16,9 @@ from scipy.ndimage import distance_transform_edt
 from jawusd.base.arrays import Array
 from jawusd.geometry import Camera
 from jawusd.media.working_view import shrunk
+from jawusd.tracking.contour.rendering import Rendering
 from jawusd.tracking.contour.scan import ARCHES, CROWN, GUM, Scan
+from jawusd.tracking.contour.solver import ContourSolver
 from jawusd.tracking.contour.views import View
 from jawusd.tracking.region.colours import PATCHES, Areas, CameraColours, colour_bins
 from jawusd.tracking.region.view import Counts, RegionView
@@ -141,3 +144,34 @@ class LearnedColours:
             known = np.isfinite(counts.gum_px)
             step = _GUM_RATE * (counts.gum_px[known] - self._gum_px[known, c])
             self._gum_px[known, c] = np.clip(self._gum_px[known, c] + step, -_MOST_GUM_PX, _MOST_GUM_PX)
+
+
+class InstantViews:
+    """Images of one frame: their views, and the rendering shared by all alignments of that frame.
+
+    Attributes:
+        views, rendering: views of the images, and the rendering of thinned scans in them.
+        counting: the same views for refined alignments, which count the colours beside borders for `learn`.
+    """
+
+    def __init__(
+        self,
+        colours: LearnedColours,
+        pictures: Sequence[Picture | None],
+        before: Array,
+        solvers: tuple[ContourSolver, ContourSolver],
+    ) -> None:
+        """Prepare the views for solvers with thinned and with coarse scans; see `LearnedColours.views`."""
+        self._colours, self._pictures, self._before, (thin, self._coarse) = colours, pictures, before, solvers
+        self.views = colours.views(pictures, before)
+        self.counting, self.rendering = colours.counting(self.views), thin.rendering(self.views)
+
+    @cached_property
+    def coarse(self) -> tuple[Sequence[View], Rendering]:
+        """The views and their rendering at the resolution of a search."""
+        views = self._colours.coarse_views(self._pictures, self._before)
+        return views, self._coarse.rendering(views)
+
+    def learn(self, poses: Array, rates: tuple[float, float]) -> None:
+        """Update the colour models from both sides of the borders matched in the refined alignment."""
+        self._colours.learn(self.counting, self._pictures, poses, rates)

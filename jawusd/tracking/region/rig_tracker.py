@@ -21,12 +21,15 @@ from jawusd.tracking.performance.instant import Aligned, Expected, InstantSolver
 from jawusd.tracking.performance.motion import Prediction
 from jawusd.tracking.performance.single_start import spread_out
 from jawusd.tracking.region.appearance import FIRST_RATES, RATES, Cut, LearnedColours
-from jawusd.tracking.region.effort import FAR_GATES_PX, THOROUGH, TRIAL_GATES_PX, Effort
 from jawusd.tracking.region.instant_images import Begun, InstantImages
 from jawusd.tracking.region.search import (
     AGAIN,
+    FAR_GATES_PX,
     LEAST_USUAL,
+    THOROUGH,
+    TRIAL_GATES_PX,
     USUAL_FRAMES,
+    Effort,
     head_shifts,
     rank_by_colour,
 )

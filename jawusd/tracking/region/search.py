@@ -1,12 +1,10 @@
-"""Alignment of both arches with colour borders: from predictions, from other starts, and by search."""
+"""Alignment of both arches with colour borders: from predictions, from other starts, and by search; its effort."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import Executor
-from dataclasses import replace
-from functools import cache
-from typing import NamedTuple
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -15,12 +13,10 @@ from jawusd.geometry import relative_pose, se3_exp, se3_inverse, transform_point
 from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.contour.equations import Solution, translation
 from jawusd.tracking.contour.quality import fitting_share, score_px
-from jawusd.tracking.contour.rendering import Rendering
 from jawusd.tracking.contour.scan import Scan, thinned
 from jawusd.tracking.contour.solver import ContourSolver
 from jawusd.tracking.contour.views import View, present_masks
-from jawusd.tracking.region.appearance import COARSE, CORRELATION_PX
-from jawusd.tracking.region.effort import FAR_GATES_PX, NEAR_GATES_PX, TRIAL_GATES_PX
+from jawusd.tracking.region.appearance import COARSE, CORRELATION_PX, InstantViews, LearnedColours, Picture
 from jawusd.tracking.region.jaw_priors import BiteTerm, CondyleMotion, CondyleTerm
 from jawusd.tracking.region.view import RegionView
 from jawusd.tracking.sequence.history import MotionPredictor
@@ -78,6 +74,54 @@ _FAST_MM = 1.0  # predicted motion per frame above which other starts are tried 
 _HOPEFUL_NEAR, _HOPEFUL, _FINALISTS = 12, 24, 3
 
 
+#: Residual gates of an alignment that starts from the prediction, and of one that starts from a more distant pose [px].
+NEAR_GATES_PX, FAR_GATES_PX = (6.0, 4.0, 3.0, 2.5, 2.0), (12.0, 8.0, 6.0, 4.0, 3.0, 2.5, 2.0)
+#: Residual gates of the short alignments by which a search compares starts [px].
+TRIAL_GATES_PX = (8.0, 6.0)
+_Gates = tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class Effort:
+    """Steps of an alignment, conditions for starting searches, and their sizes; by default, for recorded images."""
+
+    gates_px: _Gates = NEAR_GATES_PX  # residual gates of the steps of an alignment that starts from the prediction
+    next_px: _Gates = NEAR_GATES_PX  # residual gates after one dropped frame
+    far_px: _Gates = NEAR_GATES_PX  # residual gates after several dropped frames
+    wide_px: _Gates | None = FAR_GATES_PX  # gates for other starts and at the end of a search; None: `gates_px`
+    uncertain: float = 0.8  # fraction of the usual matched contour below which other starts are tried
+    searched: float = 0.6  # fraction below which a search starts, provided that hardly any frames were dropped
+    jaws: int = 16  # number of jaw poses tried by a search
+    finalists: int = 3  # number of jaw poses aligned fully
+    heads: int = 12  # number of head poses tried
+    search_every: int = 1  # interval between searches, in failed frames
+    searches: int = 8  # number of failed frames after which teeth count as not visible
+    later_every: int = 8  # like `search_every`, once teeth count as not visible
+    in_turn: bool = False  # whether jaw and head are then searched for in different frames, to limit the time per frame
+    learn_every: int = 1  # interval between updates of the colours, in frames
+
+
+#: Effort for recorded images.
+THOROUGH = Effort()
+#: Effort for live images; searches are less frequent, since frames are dropped during a search.
+FAST = Effort(
+    gates_px=(8.0, 3.0, 2.0),
+    next_px=(16.0, 6.0, 2.5, 2.0),
+    far_px=(24.0, 14.0, 8.0, 4.0, 2.0),
+    wide_px=None,
+    uncertain=0.6,
+    searched=0.4,
+    jaws=4,
+    finalists=1,
+    heads=3,
+    search_every=2,
+    searches=4,
+    later_every=6,
+    in_turn=True,
+    learn_every=6,
+)
+
+
 def head_shifts(T_world_head: Array, axes: Array) -> Array:
     """Return candidate head motions in the world, shape (N, 4, 4); `axes` (3, 3) map scan axes to left, up, front."""
     to_world = T_world_head[:3, :3] @ axes.T
@@ -90,11 +134,6 @@ def turned_starts(condyles: CondyleMotion, bases: Sequence[Array]) -> list[Array
     turns = [np.deg2rad(a) * axes[0] for a in _OPENED] + [np.deg2rad(a) * axes[1] for a in _ASIDE]
     about = [translation(hinge) @ se3_exp(np.append(turn, np.zeros(3))) @ translation(-hinge) for turn in turns]
     return [base @ turn for turn in about for base in bases]
-
-
-def starts_everywhere(condyles: CondyleMotion) -> list[Array]:
-    """Return poses T_upper_lower (4, 4) throughout the human range of motion."""
-    return [condyles.placed(*place) for place in _PLACES_MM]
 
 
 def rank_by_colour(
@@ -118,14 +157,6 @@ def rank_by_colour(
             inside = (x >= 0) & (y >= 0) & (x < like.shape[1]) & (y < like.shape[0])
             scores[k] += float(like[y[inside], x[inside]].sum())
     return [int(k) for k in np.argsort(-scores, kind="stable")]
-
-
-class InstantViews(NamedTuple):
-    """Views of a video frame, and the rendering shared by all alignments of that frame."""
-
-    views: Sequence[View]
-    rendering: Rendering
-    coarse: Callable[[], tuple[Sequence[View], Rendering]]  # returns both at the resolution of a search
 
 
 class PoseSearch:
@@ -196,7 +227,7 @@ class PoseSearch:
         """Try earlier and rotated jaw poses, with `everywhere` also the full human range; keep the head pose."""
         near = [se3_inverse(poses[0]) @ poses[1] for poses in (last, *motion.pose_history())]
         near += turned_starts(self.condyles, (se3_inverse(predicted[0]) @ predicted[1], near[0]))
-        anywhere = starts_everywhere(self.condyles) if everywhere else []
+        anywhere = [self.condyles.placed(*place) for place in _PLACES_MM] if everywhere else []
         head, pairs = solution.poses[0], []
         for jaws, count in ((near, _HOPEFUL_NEAR if everywhere else _HOPEFUL), (anywhere, _HOPEFUL)):
             order = rank_by_colour([head @ jaw for jaw in jaws], look.views, self._thin.scans, 1)[:count]
@@ -232,20 +263,14 @@ class PoseSearch:
         both = self.near(solution.poses, look, firm=True)
         return self._better(solution, both) if fitting_share(both)[1] >= least else solution
 
-    def look(self, views: Sequence[View], coarse_views: Callable[[], Sequence[View]]) -> InstantViews:
-        """Return views with a shared rendering; `coarse_views`, called at most once, returns them as for a search."""
+    def look(self, colours: LearnedColours, pictures: Sequence[Picture | None], before: Array) -> InstantViews:
+        """Return the views of a frame; arguments are as for `LearnedColours.views`."""
+        return InstantViews(colours, pictures, before, (self._thin, self._coarse))
 
-        @cache
-        def coarse() -> tuple[Sequence[View], Rendering]:
-            views = coarse_views()
-            return views, self._coarse.rendering(views)
-
-        return InstantViews(views, self._thin.rendering(views), coarse)
-
-    def polished(self, solution: Solution, views: Sequence[View], look: InstantViews, *, firm: bool) -> Solution:
+    def polished(self, solution: Solution, look: InstantViews, *, firm: bool = False) -> Solution:
         """Refine an alignment with all faces of the scans; visibility is not recomputed."""
         terms = (self._firm if firm else self._loose, self._bite)
-        return self.solver.solve(solution.poses, views, LAST_GATES_PX, None, terms, rendering=look.rendering)
+        return self.solver.solve(solution.poses, look.counting, LAST_GATES_PX, None, terms, rendering=look.rendering)
 
     def objective_px(self, solution: Solution, px: float = 1.0) -> float:
         """Return the matched contour minus a penalty for implausible condyles [px], in px of the usual resolution.
@@ -261,7 +286,7 @@ class PoseSearch:
     def _trial(self, start: Array, look: InstantViews, use: Mask | None = None) -> Solution:
         """Align in a few steps at the resolution of a search."""
         gates_px = tuple(COARSE * gate for gate in TRIAL_GATES_PX)
-        views, rendering = look.coarse()
+        views, rendering = look.coarse
         return self._coarse.solve(start, views, gates_px, use, self._coarse_terms, rendering=rendering)
 
     def _align(

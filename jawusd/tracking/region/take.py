@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jawusd.base.arrays import Array, Mask
 from jawusd.formats.finding import Finding
@@ -20,6 +19,7 @@ from jawusd.tracking.contour.frame_record import NO_LOSS, FrameRecord, Loss
 from jawusd.tracking.contour.quality import matched_px, score_px
 from jawusd.tracking.contour.scan import ARCHES, Scan
 from jawusd.tracking.contour.views import View
+from jawusd.tracking.follow import true_runs
 from jawusd.tracking.initialization.magnification import measure_magnification
 from jawusd.tracking.region.appearance import CORRELATION_PX
 from jawusd.tracking.region.jaw_priors import CondyleFusion
@@ -54,20 +54,17 @@ def camera_findings(names: Sequence[str], solutions: Iterable[Solution]) -> list
     seen_at_all = np.isfinite(known).any(0)
     share = np.zeros(len(names))
     share[seen_at_all] = np.nanmedian(known[:, seen_at_all], axis=0)
-    return [
-        Finding(
-            "camera_rarely_used",
-            "warning",
-            f"{share[c]:.0%} of the teeth's outlines match this camera's images, compared with {share.max():.0%} for "
-            f"the best camera; at least {_LEAST_SHARE:.0%} of that is usual. This camera contributes little.",
-            value=round(float(share[c]), 3),
-            limit=round(float(_LEAST_SHARE * share.max()), 3),
-            camera=name,
-            hint="Check its video, its calibration (the camera may have moved) and its time offset.",
-        )
-        for c, name in enumerate(names)
-        if share[c] < _LEAST_SHARE * share.max()
-    ]
+    out, best = [], float(share.max())
+    for c, name in enumerate(names):
+        if share[c] < _LEAST_SHARE * best:
+            message = (
+                f"{share[c]:.0%} of the teeth's outlines match this camera's images, compared with {best:.0%} for "
+            )
+            message += f"the best camera; at least {_LEAST_SHARE:.0%} of that is usual. This camera contributes little."
+            hint = "Check its video, its calibration (the camera may have moved) and its time offset."
+            value, limit = round(float(share[c]), 3), round(_LEAST_SHARE * best, 3)
+            out.append(Finding("camera_rarely_used", "warning", message, value, limit, camera=name, hint=hint))
+    return out
 
 
 def scan_findings(
@@ -92,16 +89,6 @@ def scan_findings(
     return hands if found is None else hands + lens_findings(names, found, OF_COLOURS)
 
 
-def _longest_run(good: NDArray[np.bool_]) -> tuple[int, int]:
-    """Return the longest run of good frames, end exclusive."""
-    ends = np.flatnonzero(np.diff(np.concatenate([[0], good.astype(np.int8), [0]])))
-    runs = ends.reshape(-1, 2)
-    if len(runs) == 0:
-        return 0, 0
-    first, last = runs[np.argmax(np.ptp(runs, axis=1))].tolist()
-    return first, last
-
-
 def footage_findings(tracks: Tracks) -> list[Finding]:
     """Return a warning "footage_doubtful" [%] if the jaw is lost or uncertain by over 1 mm in too many frames."""
     sigma_mm = tracks.sigma_mm[:, :3].mean(1)
@@ -116,7 +103,7 @@ def footage_findings(tracks: Tracks) -> list[Finding]:
     )
     worst = int(np.argmax(np.where(np.isfinite(sigma_mm), sigma_mm, np.inf)))
     hint = "Inspect the overlay, light the mouth better, or draw masks (`jawusd segment`)."
-    first, last = _longest_run(~bad)
+    first, last = max(true_runs(~bad), key=lambda run: run[1] - run[0], default=(0, 0))
     if last - first >= _MOST * len(bad):
         kept = f"[{tracks.frames[first]}, {tracks.frames[last - 1] + 1}]"
         hint = f"If the other frames are too dark or too bright, set frames = {kept} in capture.toml. {hint}"
@@ -124,22 +111,24 @@ def footage_findings(tracks: Tracks) -> list[Finding]:
     return [Finding("footage_doubtful", "warning", message, value, limit, frame=int(tracks.frames[worst]), hint=hint)]
 
 
-@dataclass(frozen=True, eq=False)
-class TakeFacts:
-    """Properties of a take that apply to all its frames."""
-
-    cameras: Sequence[Camera]  # cameras in the order of the views
-    scans: Sequence[Scan]  # upper and lower scan
-    landmarks: Array  # landmarks in mandible coordinates [mm], shape (5, 3)
-    axes: Array  # rotation from scan to anatomical axes: left, up, front; shape (3, 3)
-    rest_frame: int | None = None  # frame with closed teeth, as specified in the capture
-    registers: bool = False  # whether to register the lower scan by the frames with closed teeth
-
-
 def tracks_of(
-    followed: Mapping[int, RegionPose], take: TakeFacts, looks: Sequence[tuple[Array, Sequence[View]]] = ()
+    followed: Mapping[int, RegionPose],
+    cameras: Sequence[Camera],
+    scans: Sequence[Scan],
+    landmarks: Array,
+    axes: Array,
+    looks: Sequence[tuple[Array, Sequence[View]]] = (),
+    *,
+    rest_frame: int | None,
+    registers: bool,
 ) -> Tracks:
-    """Return the tracks of frames with estimated delays and border offsets; `looks` are as in `scan_findings`.
+    """Return the tracks of frames; delays between cameras and border offsets are estimated as well.
+
+    Args:
+        landmarks, axes: as in `CondyleMotion`.
+        looks: poses and views of some frames, as in `scan_findings`.
+        rest_frame: frame with closed teeth, as specified in the capture, or None.
+        registers: whether to register the lower scan by the frames with closed teeth.
 
     Raises:
         TrackingError: the registration of the scans is to be corrected, but the teeth are never closed.
@@ -147,30 +136,29 @@ def tracks_of(
     config = FOR_COLOURS
     solved = [(frame, found, found.solution) for frame, found in followed.items() if found.solution is not None]
     records = {frame: _record(found, solution, config) for frame, found, solution in solved}
-    point = np.mean([scan.centre for scan in take.scans], axis=0)
-    weights = rest_frames(records, take.rest_frame, take.axes[1], point, take.scans[1].probes)
-    rest = RestFrames(weights, take.rest_frame is not None, point, take.scans[1].centre, take.registers)
+    point = np.mean([scan.centre for scan in scans], axis=0)
+    weights = rest_frames(records, rest_frame, axes[1], point, scans[1].probes)
+    rest = RestFrames(weights, rest_frame is not None, point, scans[1].centre, registers)
     middle = np.median([record.solution.centres for record in records.values()], axis=(0, 1))
-    extrinsics = Extrinsics.calibrated(take.cameras, middle)
-    variance = outline_variance(records, config)
-    equations = TakeEquations(records, variance, extrinsics, annotator=BORDERS)
-    observe_bite(equations, records, rest, extrinsics, variance)
+    extrinsics = Extrinsics.calibrated(cameras, middle)
+    equations = TakeEquations(records, outline_variance(records, config), extrinsics, annotator=BORDERS)
+    observe_bite(equations, rest)
     nuisances = equations.solve(config, False)
-    names = tuple(camera.name for camera in take.cameras)
+    names = tuple(camera.name for camera in cameras)
     findings = [
         *camera_findings(names, [solution for _, _, solution in solved]),
-        *scan_findings(names, take.scans, take.axes[0], looks, config),
+        *scan_findings(names, scans, axes[0], looks, config),
         *time_findings(names, records, nuisances, extrinsics, config),
     ]
     notes: TracksMeta = {
-        "painted": [s.painted for s in take.scans],
+        "painted": [s.painted for s in scans],
         "findings": [found.as_json() for found in findings],
     }
     moved = {f: np.stack([corrected_pose(records, f, arch, nuisances) for arch in ARCHES]) for f in records}
     records = {f: replace(r, solution=replace(r.solution, poses=moved[f])) for f, r in records.items()}
     least_mm = np.array([followed[frame].least_mm for frame in sorted(records)])
-    fuse = CondyleFusion(take.landmarks, take.axes, least_mm)
-    return assemble(records, names, take.landmarks, nuisances, extrinsics, config, rest, notes, fuse)
+    fuse = CondyleFusion(landmarks, axes, least_mm)
+    return assemble(records, names, landmarks, nuisances, extrinsics, config, rest, notes, fuse)
 
 
 def _record(found: RegionPose, solution: Solution, config: TrackingConfig) -> FrameRecord:

@@ -6,7 +6,6 @@ from collections import deque
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
-from functools import partial
 
 import numpy as np
 
@@ -24,13 +23,20 @@ from jawusd.tracking.contour.quality import (
 from jawusd.tracking.contour.scan import ARCHES, Scan, probe_points
 from jawusd.tracking.contour.views import View
 from jawusd.tracking.initialization.first_frame import FIRST_ROUNDS
-from jawusd.tracking.region.appearance import CORRELATION_PX, FIRST_RATES, RATES, Cut, LearnedColours, Picture
-from jawusd.tracking.region.effort import THOROUGH
+from jawusd.tracking.region.appearance import (
+    CORRELATION_PX,
+    FIRST_RATES,
+    RATES,
+    Cut,
+    InstantViews,
+    LearnedColours,
+    Picture,
+)
 from jawusd.tracking.region.search import (
     AGAIN,
     LEAST_USUAL,
+    THOROUGH,
     USUAL_FRAMES,
-    InstantViews,
     PoseSearch,
     fraction_in_sight,
 )
@@ -102,13 +108,13 @@ class RegionTracker:
         """Learn the colours of a first frame at poses accurate to a few tenths of a millimetre, and refine them."""
         self._colours.begin(cut(poses), poses)
         for _ in range(FIRST_ROUNDS):
-            pictures = cut(poses)
-            instant = _Instant(self._search, self._colours, pictures, poses)
-            rough = self._search.near(poses, instant.look)
-            solution = instant.polished(rough)
+            look = self._search.look(self._colours, cut(poses), poses)
+            rough = self._search.near(poses, look)
+            solution = self._search.polished(rough, look)
             poses = solution.poses
-            instant.learn(poses, FIRST_RATES)
-        self._first_share, self.first_fit = fitting_share(rough), instant.first_fit(solution)
+            look.learn(poses, FIRST_RATES)
+        self._first_share = fitting_share(rough)
+        self.first_fit = float(fraction_in_sight(solution, look.counting).min())
         objective_px = self._search.objective_px(solution)
         return RegionPose(poses, np.ones(2, bool), _covariance(solution), objective_px, solution)
 
@@ -127,29 +133,6 @@ class RegionTracker:
             yield found
 
 
-class _Instant:
-    """Images of one frame and their alignment."""
-
-    def __init__(
-        self, search: PoseSearch, colours: LearnedColours, pictures: Sequence[Picture | None], before: Array
-    ) -> None:
-        self._search, self._colours, self._pictures = search, colours, pictures
-        self.look = search.look(colours.views(pictures, before), partial(colours.coarse_views, pictures, before))
-        self._counting = colours.counting(self.look.views)
-
-    def polished(self, solution: Solution, *, firm: bool = False) -> Solution:
-        """Refine an alignment with all faces of the scans."""
-        return self._search.polished(solution, self._counting, self.look, firm=firm)
-
-    def first_fit(self, polished: Solution) -> float:
-        """Return the matched fraction of the contour in sight, of the worse arch, 0 .. 1."""
-        return float(fraction_in_sight(polished, self._counting).min())
-
-    def learn(self, poses: Array, rates: tuple[float, float]) -> None:
-        """Update the colour models from both sides of the borders matched in the refined alignment."""
-        self._colours.learn(self._counting, self._pictures, poses, rates)
-
-
 class _DirectionTracker:
     """Tracker that follows the teeth in one temporal direction."""
 
@@ -166,11 +149,11 @@ class _DirectionTracker:
             starts = self._motion.starts()
             head, wide = starts[0][0], self._search.condyles.placed(0.0, _WIDE_MM, 0.0)
             pictures = cut(starts[0] if self._found[1] else np.stack([head, head @ wide]))
-            instant = _Instant(self._search, self._colours, pictures, self._poses)
+            look = self._search.look(self._colours, pictures, self._poses)
             usual = np.median([*self._usual] or [self._first_share], axis=0)
             usual = np.maximum(usual, LEAST_USUAL * self._first_share)
-            rough, searched = self._located(starts, instant.look, usual)
-            yield self._taken(instant, rough, searched, usual, any(picture is not None for picture in pictures))
+            rough, searched = self._located(starts, look, usual)
+            yield self._taken(look, rough, searched, usual, any(picture is not None for picture in pictures))
 
     def _located(self, starts: list[Array], look: InstantViews, usual: Array) -> tuple[Solution, bool]:
         """Return a rough alignment, and whether it came from a search."""
@@ -202,9 +185,9 @@ class _DirectionTracker:
         """Return the fraction of the usual matched contour below which each arch counts as not found, shape (2,)."""
         return np.where(self._found, _LOST, AGAIN)
 
-    def _taken(self, instant: _Instant, rough: Solution, searched: bool, usual: Array, seen: bool) -> RegionPose:
+    def _taken(self, look: InstantViews, rough: Solution, searched: bool, usual: Array, seen: bool) -> RegionPose:
         """Refine a rough alignment, decide which arches are found, and learn if both are."""
-        solution = instant.polished(rough, firm=searched)
+        solution = self._search.polished(rough, look, firm=searched)
         share, least = fitting_share(rough), self._least()
         found = (share >= least * usual) & (matched_px(solution) >= self._search.config.least_matched_px)
         # A lost jaw that fits a little keeps its pose as the start for the next frame, but is not found.
@@ -213,7 +196,7 @@ class _DirectionTracker:
         poses = np.where(kept[:, None, None], solution.poses, self._motion.predict())
         covariance = np.where(found[:, None, None], _covariance(solution), np.nan)
         if found.all():
-            instant.learn(poses, RATES)
+            look.learn(poses, RATES)
             self._search.condyles.learn(relative_pose(*poses), relative_covariance(poses[0], *covariance))
             self._usual.append(share)
         self._motion.update(poses, found, np.full(2, seen), guessed)

@@ -23,7 +23,6 @@ from jawusd.geometry import relative_pose, se3_adjoint, se3_exp, se3_inverse, se
 from jawusd.tracking.contour.equations import translation
 from jawusd.tracking.contour.frame_record import FrameRecord, whole_frames
 from jawusd.tracking.contour.scan import ARCHES
-from jawusd.tracking.sequence.extrinsics import Extrinsics
 from jawusd.tracking.sequence.nuisance import TakeEquations, pose_response
 
 # Criteria for frames in which the teeth rest in contact: maximum relative motion of the arches [mm/frame at the teeth],
@@ -74,10 +73,7 @@ def rest_frames(
 
 
 def _likeness(relative: Mapping[int, Array], frame: int, other: int, probes: Array, limit_mm: float) -> float:
-    """Return a weight for the distance of the lower arch between two frames: 0 at the limit, or if one is not tracked.
-
-    The weight is the bisquare of Beaton & Tukey (1974).
-    """
+    """Return the bisquare weight (Beaton & Tukey 1974) of the lower arch's motion; 0 if a frame is not tracked."""
     if frame not in relative or other not in relative:
         return 0.0
     ratio = min(_moved_mm(relative[frame], relative[other], probes) / limit_mm, 1.0)
@@ -152,11 +148,9 @@ class ClosedBite:
         """Return the covariances of left twists about the world origin after the correction, shape (F, 6, 6).
 
         Args:
-            covariance, steady: total covariance before the correction, and the part of it that is constant, shapes (F,
-                6, 6).
-            T_world_scan: poses in whose axes the error is constant, shape (F, 4, 4).
-            which: 0 upper arch, 1 lower arch, 2 lower arch relative to upper arch (`T_world_scan` is then the
-                identity).
+            covariance, steady: covariance before the correction, and its constant part, shapes (F, 6, 6).
+            T_world_scan: poses in whose axes the error is constant, shape (F, 4, 4); the identity for relative poses.
+            which: 0 upper arch, 1 lower arch, 2 lower arch relative to upper arch.
         """
         A = se3_adjoint(translation(-self.point) @ se3_inverse(T_world_scan))
         back = np.linalg.inv(A)
@@ -176,11 +170,8 @@ def closed_bite(
 ) -> ClosedBite | None:
     """Attribute the deviation from occlusion in the rest frames to its causes; None if no rest frame is tracked.
 
-    Args:
-        frames: frame numbers, shape (F,).
-        poses: T_world_upper, T_world_lower, shape (F, 2, 4, 4), NaN where lost.
-        outline, habits: covariances of the poses' left twists by outline errors of frames and by annotator bias, (F, 2,
-            6, 6).
+    `outline` and `habits` are covariances (F, 2, 6, 6) of the left twists of poses (F, 2, 4, 4), NaN where lost, by
+    outline errors of frames and by annotator bias.
     """
     point = rest.point
     known = np.asarray(np.isfinite(poses).all((1, 2, 3)) & np.isfinite(outline).all((1, 2, 3)), bool)
@@ -265,14 +256,9 @@ def check_registration(found: Registration) -> None:
         )
 
 
-def observe_bite(
-    equations: TakeEquations,
-    records: Mapping[int, FrameRecord],
-    rest: RestFrames,
-    extrinsics: Extrinsics,
-    variance_px3: Array,
-) -> None:
+def observe_bite(equations: TakeEquations, rest: RestFrames) -> None:
     """Add the observation that the teeth are closed: outline biases that separate the teeth become unlikely."""
+    records = equations.records
     used = {f: w for f, w in rest.weights.items() if f in records and records[f].found.all()}
     if not used:
         return
@@ -283,9 +269,9 @@ def observe_bite(
         head = solution.poses[0]
         found.append(se3_log(back @ relative_pose(*solution.poses) @ there))
         to_skull = [se3_adjoint(back @ se3_inverse(head) @ translation(solution.centres[r])) for r in ARCHES]
-        upper, lower = (to_skull[r] @ pose_response(records, frame, r, extrinsics) for r in ARCHES)
+        upper, lower = (to_skull[r] @ pose_response(records, frame, r, equations.extrinsics) for r in ARCHES)
         slopes.append(lower - upper)
-        H = solution.outline.precision.sum(1) / variance_px3[:, None, None]
+        H = solution.outline.precision.sum(1) / equations.variance_px3[:, None, None]
         spread.append(np.sum([to_skull[r] @ np.linalg.pinv(H[r]) @ to_skull[r].T for r in ARCHES], axis=0))
     weights = np.array([*used.values()])
     deviation, slope, outline = (np.average(part, axis=0, weights=weights) for part in (found, slopes, spread))

@@ -120,7 +120,7 @@ class TakeEquations:
             extrinsics: the camera poses used for the alignment.
             annotator: prior of the mask biases.
         """
-        self._extrinsics = extrinsics
+        self.records, self.variance_px3, self.extrinsics = records, variance_px3, extrinsics
         self._layout = _Layout(len(extrinsics.twists), annotator)
         size, C = self._layout.size, self._layout.cameras
         self._S, self._r, self._weight = np.zeros((size, size)), np.zeros(size), 0.0
@@ -160,7 +160,7 @@ class TakeEquations:
         redundancy = layout.redundancy(self._frames)
         S = self._S + redundancy.max() * self._seen_S
         S[:first_twist, :first_twist] += np.diag(redundancy[:first_twist] / layout.prior_sigma() ** 2)
-        for c, precision in enumerate(self._extrinsics.precision(config.refine_turn_rad, config.refine_move_mm)):
+        for c, precision in enumerate(self.extrinsics.precision(config.refine_turn_rad, config.refine_move_mm)):
             S[layout.twist(c), layout.twist(c)] += precision
         # A delay common to all cameras cannot be distinguished from the motion of the teeth.
         keep = np.arange(1, size if cameras_move else first_twist)

@@ -173,10 +173,7 @@ class _Take(Passes):
         return found
 
     def scans_and_lenses(self, left: Array) -> list[Finding]:
-        """Return findings about focal lengths, distortion and scans from the uncorrected take.
-
-        `left` is a unit vector in scan coordinates, shape (3,).
-        """
+        """Return findings about lenses and scans from the uncorrected take; `left` (3,) is in scan coordinates."""
         whole = whole_frames(self.records)
         if not whole:
             return []
@@ -192,7 +189,7 @@ class _Take(Passes):
     def _equations(self, extrinsics: Extrinsics, rest: RestFrames) -> TakeEquations:
         variance = outline_variance(self.records, self._config)
         equations = TakeEquations(self.records, variance, extrinsics, annotator=drawn_prior(self._solver.scans))
-        observe_bite(equations, self.records, rest, extrinsics, variance)
+        observe_bite(equations, rest)
         return equations
 
     def _settle(
@@ -217,7 +214,7 @@ class _Take(Passes):
                 solution = self._solver.solve(start, views, c.gates_from(0.0), used)
                 records[frame] = replace(records[frame], solution=solution)
             equations = TakeEquations(records, variance, extrinsics, sample, drawn_prior(self._solver.scans))
-            observe_bite(equations, records, sampled_rest, extrinsics, variance)
+            observe_bite(equations, sampled_rest)
             more = equations.solve(c, cameras_moved)
             found = found.plus(more)
             if more.settled(c):
