@@ -55,10 +55,8 @@ def align_photographs(
 ) -> PhotoAlignment:
     """Align both arches with lines drawn in photographs of one bite, taken with one uncalibrated camera.
 
-    Args:
-        drawings: the lines drawn in each photograph; names must be unique.
-        meshes: upper and lower scan, each in an arbitrary frame [mm].
-        progress: called with the stage, the number of photographs done, and the total.
+    Drawings have unique names; the upper and the lower scan [mm] are each in an arbitrary frame. `progress` is called
+    with the stage, the number of photographs done, and the total.
 
     Raises:
         TrackingError: a scan has too few faces.

@@ -106,12 +106,7 @@ def _row_frame(scan: Scan, arch: int, side: float) -> Array:
 
 
 def searched(drawing: Drawing, crowns: Sequence[Crowns], usual: TypicalBite, T_upper_lower: Array) -> list[Candidate]:
-    """Return the most promising views of both arches, at most one per viewing direction.
-
-    Args:
-        crowns: upper and lower, decimated for fast rendering.
-        T_upper_lower: the assumed bite, shape (4, 4).
-    """
+    """Return the most promising views of both arches, decimated and in an assumed bite, one per viewing direction."""
     size = next_fast_len(int(1.3 * _PX_PER_MM * _WIDTHS_MM.max()), real=True)
     drawn = list(_drawn_spectra(drawing, size))
     found: list[Candidate] = []

@@ -43,10 +43,7 @@ class Scene:
     def cut(
         self, config: SegmentationConfig, reach_mm: float, seeds: Seeds | None = None
     ) -> tuple[NDArray[np.float32], Mask]:
-        """Segment both arches, refine their borders, and keep annotated pixels.
-
-        Return the coverage of both arches, shape (2, h, w), and the pixels with visible borders, shape (h, w).
-        """
+        """Return the coverage of both arches (2, h, w), cut, refined and annotated, and visible borders (h, w)."""
         rgb, expected, px_per_mm = self.window.rgb, self.expected, self.px_per_mm
         shares = cut_arches(rgb, expected, self.colours, config, px_per_mm, reach_mm, seeds)
         shares, clear = refine_borders(shares, rgb, config, px_per_mm)
@@ -124,9 +121,7 @@ class CameraSegmenter:
     ) -> Segment | None:
         """Segment a recorded RGB image (H, W, 3); None if the teeth are out of view.
 
-        Args:
-            poses: expected T_world_upper, T_world_lower, shape (2, 4, 4).
-            turn: number of the iteration; 0 with predicted poses, 1 or more with refined poses.
+        Poses (2, 4, 4) are predicted in iteration 0, and refined in the next ones; `turn` is its number.
         """
         c = self._config
         scene = self._scene(image, poses)

@@ -211,11 +211,7 @@ class ColourStates:
         self._folder, self._colours = folder, dict(colours)
 
     def save(self, frame: int, step: int) -> None:
-        """Save the colours after a frame.
-
-        Raises:
-            OutputError: the file cannot be written.
-        """
+        """Save the colours after a frame; raises OutputError if the file cannot be written."""
         arrays: dict[str, ArrayLike] = {"frame": frame, "step": step}
         for name, model in self._colours.items():
             arrays[f"seen {name}"], arrays[f"counts {name}"] = model.counts()

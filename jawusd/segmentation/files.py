@@ -40,11 +40,7 @@ def mask_path(folder: Path, camera: str, arch: str, own: int) -> Path:
 
 
 def write_mask(path: Path, mask: NDArray[np.uint8]) -> None:
-    """Write a mask (h, w) uint8 as PNG.
-
-    Raises:
-        OutputError: the file cannot be written.
-    """
+    """Write a mask (h, w) uint8 as PNG; raises OutputError if the file cannot be written."""
     # Run-length encoding is twenty times faster than the default strategy, and the files have the same size.
     settings = [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE]
     write_bytes_atomic(path, cv2.imencode(".png", mask, settings)[1].tobytes())

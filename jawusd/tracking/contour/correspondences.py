@@ -208,11 +208,7 @@ def without_smooth_errors(rows: Array, weights: Array, pixels: Array, smooth: Sm
     For rows X, weights W, interpolation weights B, prior precision p and noise ratio g, the result is
     g (X - B (B^T W B + p)^-1 B^T W X); its product with W X is the matrix of generalised normal equations.
 
-    Args:
-        rows: linear terms of every sample, shape (n, m).
-        weights: weight of every sample [px], shape (n,).
-        pixels: position of every sample in the image [px], shape (n, 2), not negative.
-        smooth: model of the errors.
+    `rows`, shape (n, m), `weights` and `pixels` are as in `LinearTerms`.
     """
     count, terms = rows.shape
     columns = int(pixels[:, 0].max() / smooth.spacing_px) + 2 if count else 0
@@ -286,9 +282,7 @@ def scatter_of_tiles(terms: LinearTerms, rest: Array, tile_px: int) -> tuple[Arr
     Outline errors are correlated along the contour, so they are summed within a tile before they are squared. The ratio
     of the result to the normal matrix gives the correlation length (cluster-robust covariance, Liang & Zeger 1986).
 
-    Args:
-        rest: as for `accumulate`.
-        tile_px: side of the square tiles, longer than the correlation length.
+    `rest` is as for `accumulate`; the square tiles are larger than the correlation length.
     """
     rows, weights, pixels = terms
     across = int(pixels[:, 0].max() / tile_px) + 1 if len(pixels) else 0

@@ -40,7 +40,7 @@ class OutlineSums(NamedTuple):
     Annotator bias has three components: at tooth edges [px], at the gum line in the image [px], and at the gum line
     along the crown surface [mm]. It shifts the outline by their scalar product with h, the last columns of a sample.
     At the end of an alignment with masks, smooth outline errors are eliminated from the first five sums (see
-    `smooth_errors`).
+    `without_smooth_errors`).
     """
 
     precision: Array  # sum w J^T J, shape (2, C, 6, 6)

@@ -54,10 +54,7 @@ def view_residual_px(solution: Solution) -> Array:
 def uncovered_px(
     scans: Sequence[Scan], poses: Array, views: Sequence[View], in_threads: Mapper = map
 ) -> tuple[Array, Array]:
-    """Return the number of mask pixels not covered by projected crowns (E_SP in eq. 8 of the paper), and of all pixels.
-
-    Both have shape (2, C).
-    """
+    """Return numbers of mask pixels outside projected crowns (E_SP in eq. 8 of the paper), and of all, (2, C) each."""
     uncovered, total = np.zeros((2, len(views))), np.zeros((2, len(views)))
 
     def count(task: tuple[int, int]) -> None:
@@ -74,9 +71,7 @@ def uncovered_px(
 def penalised_score_px(solution: Solution, uncovered: Array, uncovered_price: float) -> Array:
     """Return the matched contour less the penalty for uncovered mask, per arch and view [px], shape (2, C).
 
-    Args:
-        uncovered: number of uncovered pixels, shape (2, C).
-        uncovered_price: penalty of an uncovered pixel, in px of contour [1/px].
+    `uncovered` (2, C) are numbers of pixels, and `uncovered_price` the penalty of one, in px of contour [1/px].
     """
     return score_px(solution) - uncovered_price * uncovered
 
@@ -105,12 +100,8 @@ def arch_fit(scans: Sequence[Scan], solution: Solution, views: Sequence[View], u
 def twist_covariance(solution: Solution, arch: int, sigma_px: float, correlation_px: float) -> Array:
     """Return the covariance of an arch's left twist about the world origin, sigma^2 l H^-1, shape (6, 6).
 
-    The diagonal is infinite if the masks leave a motion unconstrained.
-
-    Args:
-        sigma_px: standard deviation of the outline error.
-        correlation_px: correlation length l of outline errors: n pixels of contour contain n / l independent
-            measurements.
+    The diagonal is infinite if the masks leave a motion unconstrained. `sigma_px` is the standard deviation of the
+    outline error; with its correlation length l, n pixels of contour contain n / l independent measurements.
     """
     H = solution.outline.precision[arch].sum(0)
     if not np.isfinite(sigma_px) or np.linalg.matrix_rank(H, hermitian=True) < 6:

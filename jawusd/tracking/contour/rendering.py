@@ -205,13 +205,10 @@ class Rendering:
     def __init__(
         self, views: Sequence[View], contours: Sequence[Contour], drawings: Drawings, redraw_px: float, map: Mapper
     ) -> None:
-        """Start without drawings.
+        """Start without drawings; those in the cache `drawings` are shared between frames.
 
-        Args:
-            contours: contours of the upper and lower arch, sampled while drawing.
-            drawings: cache shared between frames.
-            redraw_px: image motion after which an arch is rendered again.
-            map: distributes the drawing among threads.
+        The contours of both arches are sampled while drawing, which `map` distributes among threads. An arch is
+        rendered again once its image has moved by `redraw_px`.
         """
         self._contours, self._drawings, self._redraw_px, self._map = contours, drawings, redraw_px, map
         self._views = views

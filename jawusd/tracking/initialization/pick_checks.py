@@ -46,10 +46,8 @@ Seen = Callable[[str, str], tuple[Array, Array]]
 def pick_findings(given: Setting, seen: Sequence[Seen], masked: Sequence[str], frame: int) -> Iterator[Finding]:
     """Yield findings about the picks of a frame, and about other inputs that the picks contradict.
 
-    Args:
-        given: the inputs as in the capture.
-        seen: readers of the masks, one per candidate set of time offsets.
-        masked: cameras that have masks.
+    The inputs are as in the capture; `seen` has a reader of the masks of the cameras in `masked` per candidate set of
+    time offsets.
 
     Raises:
         TrackingError: the picks contradict one another, and no single mistake explains it.

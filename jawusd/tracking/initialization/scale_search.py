@@ -44,11 +44,7 @@ def seen_size(
 ) -> float:
     """Return the size of the teeth in the calibrated world relative to the scans, accurate to 0.5 %.
 
-    Args:
-        cameras: calibrated up to the scale of the world.
-        offsets: time offsets by camera name: the reference frame number minus the camera's own frame number.
-        meshes: upper and lower teeth scans in one coordinate frame, in occlusion [mm].
-        map_: distributes the search among threads.
+    The cameras are calibrated up to the scale of the world; other arguments are as for `find_start`.
 
     Raises:
         TrackingError: too few masks, or the scans do not fit the masks at any size.

@@ -165,9 +165,8 @@ def find_start(
     """Return the first frame and its poses, from the capture's picks or, without picks, by search.
 
     Args:
-        offsets: time offsets by camera name: the reference frame number minus the camera's own.
-        meshes: upper and lower teeth scans in one coordinate frame, in occlusion [mm].
-        solver: solver prepared with the same scans.
+        offsets: as in `Footage`.
+        meshes, solver: upper and lower scan in one frame, in occlusion [mm], and a solver prepared with them.
         map_: distributes the search among threads.
 
     Raises:

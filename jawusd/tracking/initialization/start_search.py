@@ -20,8 +20,7 @@ from jawusd.tracking.contour.views import View
 from jawusd.tracking.initialization.footage import Footage
 from jawusd.tracking.initialization.pose_search import Grid, coarse_scan, distinct, hinge_at_front, search_arch
 
-# resolution of the search: a pixel is a third of the motion of the canines between neighbouring orientations
-_PX_PER_MM = 2.0
+_PX_PER_MM = 2.0  # resolution: a pixel is a third of the motion of the canines between neighbouring orientations
 _FINALISTS = 5  # number of poses per arch that are refined
 _DISTINCT_MM = 2.0  # minimum distance of distinct poses [mm]: closer ones converge to the same local minimum
 # Rotations and translations around a guess in which the teeth face the cameras with the upper arch above the lower one.
@@ -111,8 +110,7 @@ class StartSearch:
     def at(self, footage: Footage, frame: int) -> SearchResult:
         """Return the best poses on a frame.
 
-        Raises:
-            TrackingError: too few masks, or no anatomically possible pair of poses.
+        Raises TrackingError for too few masks, or without an anatomically possible pair of poses.
         """
         survey = footage.survey((frame, frame + 1), 1)
         places = survey.places()[0]
@@ -124,11 +122,7 @@ class StartSearch:
         return self._settled(finalists, views, footage, frame)
 
     def near(self, footage: Footage, frame: int, poses: Array) -> SearchResult:
-        """Return the best poses in a video frame, searched near T_world_upper and T_world_lower, shape (2, 4, 4).
-
-        Raises:
-            TrackingError: no anatomically possible pair of poses.
-        """
+        """Return the best poses in a frame, searched near given ones (2, 4, 4); raises TrackingError as `at` does."""
         with footage.views(transform_point(poses[0], self._coarse[0].centre), _PX_PER_MM) as masks:
             views = masks.at(frame)
         finalists = []

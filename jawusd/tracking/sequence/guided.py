@@ -43,14 +43,9 @@ class GuidedTracker:
         config: TrackingConfig | None = None,
         executor: Executor | None = None,
     ) -> None:
-        """Prepare the scans, which are in one coordinate frame, in occlusion [mm].
+        """Prepare the scans, in one coordinate frame and in occlusion [mm]; errors are those of `prepare_scan`.
 
-        Args:
-            see: generates the masks of a frame; masks generated around a wrong pose tend to confirm that pose.
-            rounds: number of times that the masks and then the poses of a frame are updated.
-
-        Raises:
-            TrackingError: a scan cannot be tracked.
+        In each of `rounds`, `see` generates the masks of a frame, which tend to confirm the poses, and poses follow.
         """
         self._config = config or FOR_AUTO_MASKS
         self._vertices = upper.vertices, lower.vertices
@@ -90,8 +85,8 @@ class GuidedTracker:
         """Yield frame numbers and records; poses of lost arches are replaced by those of `guide`.
 
         Args:
-            frames: frame numbers in either direction, starting next to a frame in `past`.
-            guide: T_world_upper and T_world_lower, as found by colour, shape (2, 4, 4), by frame.
+            frames: frame numbers in either direction.
+            guide: poses by frame, as found by colour, shape (2, 4, 4).
             past: summaries of the frames tracked before, from the first aligned frame to the neighbour of `frames`.
         """
         history = History(self._config.history_frames, self._config.score_frames)

@@ -52,11 +52,9 @@ class MotionPredictor:
         return [moving, self._last.copy(), half]
 
     def update(self, poses: Array, found: Mask, seen: Mask, guessed: bool = False) -> None:
-        """Add the next frame; for arches not found, keep the predictions or, if `guessed`, the given poses.
+        """Add the poses (2, 4, 4) of a frame; for arches not found, keep predictions or, if `guessed`, these poses.
 
-        Args:
-            poses: T_world_upper, T_world_lower, shape (2, 4, 4).
-            found, seen: whether each arch has a reliable pose, and any mask, shape (2,).
+        `found` and `seen` (2,) are whether each arch has a reliable pose, and any mask.
         """
         expected = self.predict()
         for r in ARCHES:

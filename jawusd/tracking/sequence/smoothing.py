@@ -41,8 +41,7 @@ def smooth_poses(frames: NDArray[np.int64], poses: Array, covariance: Array, cen
     Lost frames remain NaN, and runs of fewer than five frames remain unchanged.
 
     Args:
-        frames: frame numbers, shape (F,).
-        poses: measured poses, NaN where lost, shape (F, 4, 4).
+        frames, poses: frame numbers (F,), and measured poses (F, 4, 4), NaN where lost.
         covariance: covariance of the poses' left twists about the world origin, shape (F, 6, 6).
         centre: the fixed point, near the moving points [mm], shape (3,).
     """
@@ -98,10 +97,8 @@ def combine(tracks: Tracks, poses: Array, covariance: Array, landmarks: Array) -
     If the two measurements contradict each other, the covariance is scaled by the Birge ratio (Birge 1932). For lost
     arches, the second measurement is used. The combined poses are smoothed again.
 
-    Args:
-        poses: T_world_upper and T_world_lower, NaN where they were not found, shape (F, 2, 4, 4).
-        covariance: covariance of the poses' left twists about the world origin, shape (F, 2, 6, 6).
-        landmarks: points whose uncertainty is reported, in mandible coordinates [mm], shape (5, 3).
+    Poses (F, 2, 4, 4), NaN where lost, and covariances (F, 2, 6, 6) are as in `results.Fusion`; landmarks (5, 3) are in
+    mandible coordinates [mm].
     """
     raw, spread, status = np.empty_like(poses), np.empty_like(covariance), tracks.status.copy()
     for r, name in enumerate(ARCH_NAMES):
