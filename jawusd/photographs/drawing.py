@@ -113,8 +113,6 @@ class Outlines:
 
     points: Array  # points on the crowns, scan coordinates of their own arch [mm], shape (N, 3)
     arch: NDArray[np.int64]  # 0 upper, 1 lower, shape (N,)
-    # tooth number from 1, continuing from the upper to the lower arch, shape (N,); connected teeth share a number
-    tooth: NDArray[np.int64]
     pixels: Array  # image positions [px], shape (N, 2)
     normals: Array  # unit normals pointing out of the tooth in the image, shape (N, 2)
     gum: Array  # 1 where the outline faces the gum of its arch, decreasing to 0 at a right angle [-], shape (N,)
@@ -206,7 +204,7 @@ def outlines_of(
         facing = (ahead * normals[own]).sum(1) / np.maximum(np.linalg.norm(ahead, axis=1), 1e-12)
         gum[own] = np.maximum(facing, 0.0)
     clear = np.flatnonzero(np.linalg.norm(normals, axis=1) > 0)
-    return Outlines(points, arch, tooth, pixels, normals, gum).take(clear)
+    return Outlines(points, arch, pixels, normals, gum).take(clear)
 
 
 def _ends(depth: NDArray[np.float32], labels: NDArray[np.uint8]) -> tuple[Array, Array, Array, Array]:

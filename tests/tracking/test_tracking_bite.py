@@ -21,7 +21,7 @@ def state(lift_mm):
     poses = np.stack([head, head @ jaw])
     centres = np.stack([poses[r, :3, 3] + [1.0, 2.0, 3.0] for r in (0, 1)])
     none = np.zeros((2, 6, 6))
-    return Solution(poses, OutlineSums.zeros(1), centres, none, none, np.zeros((2, 1)), 0)
+    return Solution(poses, OutlineSums.zeros(1), centres, none, none, np.zeros((2, 1)))
 
 
 def cost(poses):

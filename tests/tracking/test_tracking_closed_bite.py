@@ -127,7 +127,6 @@ def _records(poses):
         np.zeros((2, 6, 6)),
         np.zeros((2, 6, 6)),
         np.zeros((2, 2)),
-        1,
     )
     status, used = np.full(2, TRACKED, np.int8), np.ones((2, 2), bool)
     return {k: FrameRecord(Solution(p, *nothing), status, used, np.zeros((2, 2))) for k, p in enumerate(poses)}

@@ -37,7 +37,7 @@ def taught(person, poses):
 def state(poses):
     nothing = np.zeros((2, 6, 6))
     centres = np.array([[3.0, -2.0, 200.0], [1.0, 4.0, 205.0]])
-    return Solution(poses, OutlineSums.zeros(1), centres, nothing, nothing, np.zeros((2, 1)), 0)
+    return Solution(poses, OutlineSums.zeros(1), centres, nothing, nothing, np.zeros((2, 1)))
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])

@@ -47,7 +47,6 @@ def terms(prior, poses, centres):
             np.zeros((2, 6, 6)),
             np.zeros((2, 6, 6)),
             np.zeros((2, 0)),
-            0,
         ),
         equations,
     )

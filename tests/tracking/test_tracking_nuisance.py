@@ -86,14 +86,10 @@ def test_scans_without_gum_have_larger_uncertainties(tmp_path, monkeypatch):
 
 def _nuisances(**values):
     """Return nuisances of two cameras, zero with small sigmas except for those given."""
-    none = {
-        "delays": np.zeros(2),
-        "habits": np.zeros((2, 2, 3)),
-        "shift_px": np.zeros((2, 2, 2)),
-        "twists": np.zeros((2, 6)),
-    }
+    none = {"delays": np.zeros(2), "habits": np.zeros((2, 2, 3)), "twists": np.zeros((2, 6))}
     sigmas = {f"sigma_{name}": np.full_like(value, 0.001) for name, value in none.items()}
-    return Nuisances(**{**none, **sigmas, "contour_px": 0.0, "covariance": np.zeros((31, 31)), **values})
+    others = {"shift_px": np.zeros((2, 2, 2)), "contour_px": 0.0, "covariance": np.zeros((31, 31))}
+    return Nuisances(**{**none, **sigmas, **others, **values})
 
 
 @pytest.mark.parametrize(
@@ -236,7 +232,6 @@ def _records(count, lost=()):
             np.zeros((2, 6, 6)),
             np.zeros((2, 6, 6)),
             np.zeros((2, 2)),
-            1,
         )
         records[f] = FrameRecord(Solution(poses, *nothing), status, np.ones((2, 2), bool), np.zeros((2, 2)))
     return records, step
@@ -327,7 +322,7 @@ def test_delays_and_habits_move_a_pose_as_least_squares_over_its_samples_would()
     records = {}
     for frame in (4, 5, 6):
         poses = np.stack([se3_exp((frame - 5) * speed)] * 2)
-        solution = Solution(poses, sums, np.zeros((2, 3)), none, none, np.ones((2, 2)), 0)
+        solution = Solution(poses, sums, np.zeros((2, 3)), none, none, np.ones((2, 2)))
         records[frame] = FrameRecord(solution, np.full(2, TRACKED), np.ones((2, 2), bool), np.zeros((2, 2)))
     nuisances = _nuisances(delays=np.array([0.0, 0.2]), habits=0.01 * rng.normal(size=(2, 2, 3)))
     for arch in (0, 1):

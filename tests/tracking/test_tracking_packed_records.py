@@ -42,7 +42,6 @@ def test_records_round_trip(records):
             assert getattr(found, name).dtype == getattr(record, name).dtype
         np.testing.assert_array_equal(np.array(found.losses, float), np.array(record.losses, float))
         own, kept = record.solution, found.solution
-        assert kept.iterations == own.iterations
         for name in ("poses", "centres", "visible_px"):
             np.testing.assert_array_equal(getattr(kept, name), getattr(own, name))
         for name in ("scatters", "gum_scatters"):

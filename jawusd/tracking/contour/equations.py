@@ -70,7 +70,6 @@ class Solution:
     scatters: Array  # first result of `scatter_of_tiles` (outline errors) per arch, summed over views, shape (2, 6, 6)
     gum_scatters: Array  # second result (gum-line errors) per arch, summed over views, shape (2, 6, 6)
     visible_px: Array  # contour length that could have been matched, per arch and view [px], shape (2, C)
-    iterations: int  # number of linearised steps
 
 
 class NormalEquations:

@@ -167,7 +167,7 @@ def _packed(record: FrameRecord) -> tuple[Array, NDArray[np.float32]]:
     solution, losses = record.solution, record.losses
     figures = (
         solution.poses, solution.centres, solution.visible_px, record.status, record.used, record.coverage,
-        [(float(loss.reason), loss.value, loss.limit) for loss in losses], [solution.iterations],
+        [(float(loss.reason), loss.value, loss.limit) for loss in losses],
     )  # fmt: skip
     sums = [solution.outline.precision[..., _LOWER[0], _LOWER[1]], *solution.outline[1:]]
     sums += [matrix[:, _LOWER[0], _LOWER[1]] for matrix in (solution.scatters, solution.gum_scatters)]
@@ -175,17 +175,16 @@ def _packed(record: FrameRecord) -> tuple[Array, NDArray[np.float32]]:
 
 
 def _unpacked(figures: Array, sums: NDArray[np.float32]) -> FrameRecord:
-    # Poses, centres, status, losses and iterations have fixed sizes; the other three arrays have one entry per arch and
-    # view.
-    views = (len(figures) - 2 * 16 - 2 * 3 - 2 - 2 * 3 - 1) // (2 * 3)
-    shapes = ((2, 4, 4), (2, 3), (2, views), (2,), (2, views), (2, views), (2, 3), (1,))
-    poses, centres, visible, status, used, coverage, losses, iterations = _split(figures, shapes)
+    # Poses, centres, status and losses have fixed sizes; the other three arrays have one entry per arch and view.
+    views = (len(figures) - 2 * 16 - 2 * 3 - 2 - 2 * 3) // (2 * 3)
+    shapes = ((2, 4, 4), (2, 3), (2, views), (2,), (2, views), (2, views), (2, 3))
+    poses, centres, visible, status, used, coverage, losses = _split(figures, shapes)
     half = (len(_LOWER[0]),)
     of_views = [(2, views, *shape) for shape in (half, *_SUM_SHAPES[1:])]
     precision, *others, scatters, gum_scatters = _split(sums.astype(np.float64), (*of_views, (2, *half), (2, *half)))
     outline = OutlineSums(precision[..., _MIRROR], *others)
     scatters, gum_scatters = (matrix[:, _MIRROR] for matrix in (scatters, gum_scatters))
-    solution = Solution(poses, outline, centres, scatters, gum_scatters, visible, int(iterations[0]))
+    solution = Solution(poses, outline, centres, scatters, gum_scatters, visible)
     first, second = (Loss(LostReason(int(reason)), float(value), float(limit)) for reason, value, limit in losses)
     return FrameRecord(solution, status.astype(np.int8), used.astype(bool), coverage, (first, second))
 

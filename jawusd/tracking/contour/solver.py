@@ -122,7 +122,7 @@ class ContourSolver:
         rendering = rendering or self.rendering(views)
         all_terms: tuple[ResidualTerm, ...] = (OutlineTerm(), StartTerm(poses, self._start_strength), *terms)
         given = (views, use, rendering, all_terms, outline_weight)
-        poses, iterations, moved_mm = self._descended(poses, tuple(gates_px), *given)
+        poses, moved_mm = self._descended(poses, tuple(gates_px), *given)
         gate = gates_px[-1] if gates_px else self.config.final_gate_px[1]
         state = self.linearise(poses, views, use, gate, rendering, final=True)
         if moved_mm < _CONVERGED_MM and self._smooth_errors(gate):
@@ -130,7 +130,7 @@ class ContourSolver:
             # estimator; van der Vaart 1998, section 5.7).
             poses, _ = self._moved(poses, state, all_terms, outline_weight)
             state = self.linearise(poses, views, use, gate, rendering, final=True)
-        return replace(state, iterations=iterations)
+        return state
 
     def _descended(
         self,
@@ -141,23 +141,21 @@ class ContourSolver:
         rendering: Rendering,
         terms: Sequence[ResidualTerm],
         outline_weight: Array | None,
-    ) -> tuple[Array, int, float]:
-        """Return the poses (2, 4, 4) after steps of least squares, their number, and the motion in the last one [mm].
+    ) -> tuple[Array, float]:
+        """Return the poses (2, 4, 4) after steps of least squares, and the motion in the last one [mm].
 
         Arguments are as for `solve`.
         """
-        earlier, left, moved_mm = 0, gates_px, np.inf
+        left, moved_mm = gates_px, np.inf
         if self.thin is not None and left:
             given = (views, use, self.thin.rendering(views), terms, outline_weight)
-            poses, earlier, _ = self.thin._descended(poses, left, *given)
+            poses, _ = self.thin._descended(poses, left, *given)
             left = left[-1:] * _DENSE_STEPS
-        iterations = 0
         while left:
-            iterations += 1
             state = self.linearise(poses, views, use, left[0], rendering)
             poses, moved_mm = self._moved(poses, state, terms, outline_weight)
             left = self.config.gates_after(left, moved_mm)
-        return poses, earlier + iterations, moved_mm
+        return poses, moved_mm
 
     def _moved(
         self, poses: Array, state: Solution, terms: Sequence[ResidualTerm], outline_weight: Array | None
@@ -227,7 +225,7 @@ class ContourSolver:
                 own, gum = scatter_of_tiles(linear, rest, config.tile_px)
                 scatters[r] += own
                 gum_scatters[r] += gum
-        return Solution(poses.copy(), outline, centres, scatters, gum_scatters, visible, 0)
+        return Solution(poses.copy(), outline, centres, scatters, gum_scatters, visible)
 
     def _match(self, pose: Array, view: View, r: int, rendering: Rendering, c: int, reach: float) -> _Match:
         config, depths = self.config, rendering.depths[c]

@@ -186,13 +186,8 @@ def picks_miss_mm(picks: Sequence[Pick], vertices: Array, cameras: Mapping[str, 
     return np.array([_miss_mm(s, pose) for s in _sightings(picks, vertices, cameras)])
 
 
-def picked_size(
-    picks: Sequence[Sequence[Pick]], vertices: Sequence[Array], cameras: Mapping[str, Camera]
-) -> tuple[float, float]:
-    """Return the size ratio of scans to triangulated picks, and its standard deviation for careless clicks [-].
-
-    `picks` and `vertices` are those of the upper and the lower scan. Raises TrackingError for an invalid pick.
-    """
+def picked_size(picks: Sequence[Sequence[Pick]], vertices: Sequence[Array], cameras: Mapping[str, Camera]) -> float:
+    """Return the size ratio of both scans to triangulated picks [-]; raises TrackingError for an invalid pick."""
     product, square = 0.0, 0.0
     for own, points in zip(picks, vertices, strict=True):
         given, places = _triangulated(_sightings(own, points, cameras))
@@ -203,7 +198,7 @@ def picked_size(
             continue  # collinear picks do not determine a rotation
         product += float((turned * (places - places.mean(0))).sum())
         square += float((turned**2).sum())
-    return square / max(product, 1e-9), _CLICK_MM / np.sqrt(max(square, 1e-9))
+    return square / max(product, 1e-9)
 
 
 def placed(picks: Sequence[Pick], vertices: Array, cameras: Mapping[str, Camera]) -> Array | None:

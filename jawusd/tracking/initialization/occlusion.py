@@ -16,7 +16,6 @@ from jawusd.tracking.contour.scan import Scan
 _SAMPLES = 8000  # number of surface samples per arch; they are about half a millimetre apart
 _SHARE = 0.002  # fraction of the crown surface that is ignored as outliers, such as spikes of the mesh
 _DEEPEST_MM = 5.0  # maximum depth of a point inside a crown [mm]: deeper points lie beyond an open border
-_DEEP_MM = 1.0
 _SAME_MM = 0.05
 _BESIDE_MM = 4.0  # maximum distance in the occlusal plane between opposed crown points [mm]: half the width of a molar
 _CELL_MM = 1.0
@@ -37,7 +36,6 @@ class Occlusion:
     gap_mm: float  # minimum distance between the crowns [mm], 0 if they touch
     side_gaps_mm: tuple[float, float]  # gaps left and right of the midline [mm], negative if crowns overlap
     depth_mm: float  # maximum depth by which the crowns overlap [mm]
-    deep_share: float  # fraction of the opposed crown surface that is more than 1 mm inside the other arch
     # fraction of the common area in the occlusal plane in which lower crowns reach more than 2 mm above the lowest
     # point of the upper ones
     through: float
@@ -80,18 +78,14 @@ def measure_occlusion(scans: Sequence[Scan], T_anatomical_scan: Array) -> Occlus
     others = [(surface, cKDTree(surface.points), _DEEPEST_MM) for surface in surfaces[::-1]]
     signed = [signed_distances(own.points, *other)[0] for own, other in zip(surfaces, others, strict=True)]
     nearest = [_weighted_quantile(d, surfaces[k].areas, _SHARE) for k, d in enumerate(signed)]
-    stand = [_beside(a, b) for a, b in ((upper, lower), (lower, upper))]
-    deep = sum(float(surfaces[k].areas[d < -_DEEP_MM].sum()) for k, d in enumerate(signed))
-    opposed = sum(float(surfaces[k].areas.sum() * stand[k].mean()) for k in (0, 1))
     midlines_mm, width_ratio = _compare_widths(upper, lower)
     return Occlusion(
         gap_mm=max(0.0, min(nearest)),
         side_gaps_mm=(_side_gap(signed, surfaces, left, middle), _side_gap(signed, surfaces, -left, -middle)),
         depth_mm=max(0.0, -min(nearest)),
-        deep_share=deep / max(opposed, 1e-9),
         through=_through(upper, lower),
         same=float(np.mean(np.abs(signed[1]) < _SAME_MM)),
-        opposite=float(max(part.mean() for part in stand)),
+        opposite=float(max(_beside(upper, lower).mean(), _beside(lower, upper).mean())),
         aside_mm=float(np.linalg.norm((upper.mean(0) - lower.mean(0))[[0, 2]])),
         turn_rad=float(np.arccos(np.clip(_forward(upper[:, [0, 2]]) @ _forward(lower[:, [0, 2]]), -1.0, 1.0))),
         turned_over=(_turned_over(scans[0], surfaces[0], -normal), _turned_over(scans[1], surfaces[1], normal)),

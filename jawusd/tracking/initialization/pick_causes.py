@@ -61,7 +61,7 @@ def possible_mistakes(given: Setting) -> Iterator[Mistake]:
         message, hint = "upper_teeth and lower_teeth in [scans] are exchanged", "Exchange the names of these files."
         yield Mistake("scans_exchanged", message, hint, replace(given, vertices=vertices, crowns=given.crowns[::-1]))
     yield from _exchanges(given)
-    size, _ = picked_size(given.picks, given.vertices, given.cameras)
+    size = picked_size(given.picks, given.vertices, given.cameras)
     if abs(size - 1.0) > _SIZE_SHARE:
         message = f"the picks show teeth {than(1.0 / size - 1.0)} than the scans: the scale of the scans or of the "
         message += "calibration is wrong"

@@ -29,7 +29,6 @@ class Nuisances:
     shift_px: Array  # the resulting mean shift of edges and gum line, shape (2, C, 2)
     sigma_delays: Array
     sigma_habits: Array
-    sigma_shift_px: Array
     twists: Array  # corrections of the camera poses as in `Extrinsics`, shape (C, 6)
     sigma_twists: Array
     contour_px: float  # rms contour shift by the twists, without the part that poses of the teeth compensate [px]
@@ -183,7 +182,6 @@ class TakeEquations:
             shift_px=shift @ x,
             sigma_delays=np.sqrt(np.diag(covariance)[:C]),
             sigma_habits=np.sqrt(np.einsum("...u,uv,...v->...", habits, covariance, habits)),
-            sigma_shift_px=np.sqrt(np.einsum("...u,uv,...v->...", shift, covariance, shift)),
             twists=twists.reshape(C, 6),
             sigma_twists=sigma_twists.reshape(C, 6),
             contour_px=float(np.sqrt(max(square, 0.0))),
