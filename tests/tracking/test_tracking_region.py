@@ -69,7 +69,7 @@ def searched(picture, share, samples, reach=LIMITS[0], other_depth=None):
     distances, weights = np.empty(len(samples)), np.empty(len(samples))
     tables = np.zeros(len(samples), np.int64)
     limits = (reach, *LIMITS[1:])
-    search_borders(samples, tables, bins, colours.ratio[0], own, other, depth, *limits, 1.0, distances, weights)
+    search_borders(samples, tables, bins, colours.ratio[0], own, other, depth, *limits, distances, weights)
     return distances, weights
 
 
@@ -81,7 +81,7 @@ def test_borders_are_found_from_either_side(off):
     assert (weights > 0.3).mean() > 0.95
     found = weights > 0
     assert np.abs(distances[found] + off).mean() < 0.6
-    sharpen(samples, picture, 20.0, 2.0, np.zeros(len(samples)), distances, weights)
+    sharpen(samples, picture, np.zeros(len(samples)), distances, weights)
     assert np.abs(distances[found] + off).mean() < 0.12
 
 
@@ -153,7 +153,7 @@ def test_without_teeth_no_border_is_found():
     depth = np.zeros((SIZE, SIZE), np.float32)
     flesh = colour_bins(np.clip(lips, 0, 255).astype(np.uint8))
     tables = np.zeros(len(samples), np.int64)
-    search_borders(samples, tables, flesh, colours.ratio[0], own, empty, depth, *LIMITS, 1.0, distances, weights)
+    search_borders(samples, tables, flesh, colours.ratio[0], own, empty, depth, *LIMITS, distances, weights)
     assert np.isnan(distances).all() and not weights.any()
 
 
@@ -167,7 +167,7 @@ def test_crowns_before_crowns_end_at_the_dark_line():
     own, other = np.zeros((SIZE, SIZE), np.uint8), np.zeros((SIZE, SIZE), np.uint8)
     own[:, :69], other[:, 69:] = CROWN, CROWN
     distances, weights = np.full(1, np.nan), np.zeros(1)
-    search_creases(samples, picture, own, other, 5.0, 25.0, 0.5, distances, weights)
+    search_creases(samples, picture, own, other, 5.0, distances, weights)
     # Half the darkness of the line is reached sqrt(2 ln 2) = 1.18 px before its centre.
     assert weights[0] == 0.5 and distances[0] == pytest.approx(2.0 - 1.18, abs=0.3)
 

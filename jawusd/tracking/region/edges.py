@@ -17,7 +17,9 @@ from jawusd.tracking.contour.samples import INVERSE_DEPTH, NX, NY, U, V, is_near
 from jawusd.tracking.contour.scan import CROWN
 
 _MOST_STEPS = 10  # maximum number of search steps to either side of a sample
-_LEAST_CLEAR = 0.15  # fraction of `clear_ratio` below which an edge is rejected
+# minimum mean log ratio on both sides for full weight of a border [-], and fraction of it below which it is rejected
+_CLEAR_RATIO, _LEAST_CLEAR = 1.0, 0.15
+_CONTRAST, _SHARP_REACH_PX = 20.0, 2.0  # minimum contrast of refined borders [8-bit steps]; maximum refinement
 # minimum and maximum motion blur that is compensated; gamma of the images
 _LEAST_BLUR_PX, _MOST_BLUR_PX, _GAMMA = 1.0, 10.0, 2.2
 _SMOOTH_PX = 1.0  # half the width over which image gradients are computed [px]
@@ -59,7 +61,6 @@ def search_borders(
     reach_px: float,
     tolerance_mm: float,
     cos_limit: float,
-    clear_ratio: float,
     out: Array,
     clearness: Array,
 ) -> None:
@@ -75,7 +76,6 @@ def search_borders(
         reach_px: search distance on either side of the sample.
         tolerance_mm: minimum depth difference between the arches for occlusion.
         cos_limit: minimum cosine between the sample's normal and the direction in which the log ratio falls.
-        clear_ratio: minimum mean log ratio on both sides for full weight of a border [-].
         out: result, shape (n,): distance, positive outwards; NaN where the sample is hidden or no border is found.
         clearness: result, shape (n,): weight, 0 .. 1; NaN where the other arch hides the sample.
     """
@@ -95,7 +95,7 @@ def search_borders(
         k = _likeliest(r, n, step, reach_px)
         if k < 0:
             continue
-        clear = min(r[k - 3 : k].mean(), -r[k + 1 : k + 4].mean()) / clear_ratio
+        clear = min(r[k - 3 : k].mean(), -r[k + 1 : k + 4].mean()) / _CLEAR_RATIO
         if clear <= _LEAST_CLEAR:
             continue
         d = _zero_crossing(r, n, step, k)
@@ -196,29 +196,19 @@ def _light(code: float) -> float:
 
 
 @numba.njit(nogil=True, cache=True)
-def sharpen(
-    samples: Array,
-    rgb: NDArray[np.uint8],
-    contrast: float,
-    reach_px: float,
-    blur_px: Array,
-    out: Array,
-    clearness: Array,
-) -> None:
+def sharpen(samples: Array, rgb: NDArray[np.uint8], blur_px: Array, out: Array, clearness: Array) -> None:
     """Move every border to the steepest colour change between its inside and outside.
 
     The midpoint between both colours would be biased, since crowns darken towards their edges.
 
     Args:
-        contrast: minimum difference of both sides' mean colours [8-bit steps].
-        reach_px: maximum distance by which a border is moved.
         blur_px: motion along the normals during the exposure, which is the width of a blurred edge, shape (n,).
         out, clearness: results of `search_borders`, updated in place; borders without a steepest point get a lower
             weight.
     """
     inner = np.empty(3)
     outer = np.empty(3)
-    line = np.empty(8 * int(reach_px + _SMOOTH_PX + _MOST_BLUR_PX) + 8)
+    line = np.empty(8 * int(_SHARP_REACH_PX + _SMOOTH_PX + _MOST_BLUR_PX) + 8)
     for s in range(len(samples)):
         if not clearness[s] > 0:
             continue
@@ -235,7 +225,7 @@ def sharpen(
             for c in range(3):
                 inner[c] += within[c] / 3
                 outer[c] += beyond[c] / 3
-        if ((inner - outer) ** 2).sum() < contrast * contrast:
+        if ((inner - outer) ** 2).sum() < _CONTRAST * _CONTRAST:
             continue
         # A moving edge is a ramp in linear light, not in gamma-encoded values. The middle of the ramp is its steepest
         # point after a second blur of the same width.
@@ -245,7 +235,7 @@ def sharpen(
             inner[c], outer[c] = (inner[c] / 255) ** power, (outer[c] / 255) ** power
             norm += (inner[c] - outer[c]) ** 2
         arm = int(2 * (_SMOOTH_PX + wide)) + 1
-        steps = int(2 * (reach_px + wide))
+        steps = int(2 * (_SHARP_REACH_PX + wide))
         for q in range(2 * (steps + arm) + 1):
             t = d + 0.5 * (q - steps - arm)
             colour = colour_at(rgb, u + t * nx, v + t * ny)

@@ -29,11 +29,11 @@ _LEARNED_PX = (2, 7)  # minimum and maximum distance from the contour of pixels 
 # Limits for estimating the gum-line offset: minimum weight of a border [-], maximum distance of a border from its
 # sample [px], and number of samples that must be exceeded.
 _SURE, _GUM_REACH_PX, _FEWEST_GUM = 0.3, 2.5, 30
-_CLEAR_RATIO = 1.0  # minimum mean log ratio on both sides for full weight of a border [-]
 _SHARPEN_PX = 5.0  # maximum search range for which borders are refined by colour [px]
-_CONTRAST, _SHARP_REACH_PX = 20.0, 2.0  # minimum contrast of refined borders [8-bit steps]; maximum refinement
 # A contour is in sight where the mean log ratio at these distances inside it [px] exceeds this value [-].
 _INNER_PX, _TOOTH_RATIO = (1.5, 2.5, 3.5, 4.5), 0.3
+# Minimum difference between the brighter tooth and a dark line [8-bit steps]; weight of the edges found [-]; maximum
+# reach for which they are searched for [px].
 _CREASE_CONTRAST, _CREASE_WEIGHT, _CREASE_REACH_PX = 25.0, 0.5, 7.0
 # Search range of dark lines around a sample, and of edges around a dark line [px]; number of half-pixel steps to either
 # side from which a gradient is computed.
@@ -72,16 +72,15 @@ def choose_tables(
 
 
 @numba.njit(nogil=True, cache=True)
-def measure_blur(samples: Array, before: Array, shutter: float, out: Array) -> None:
+def measure_blur(samples: Array, before: Array, out: Array) -> None:
     """Write the motion of contour samples along their normals during the exposure [px], shape (n,).
 
-    `before` (3, 4) projects the arch into this camera's image in the previous frame; `shutter` is the exposure as a
-    fraction of the frame time.
+    `before` (3, 4) projects the arch into this camera's image in the previous frame.
     """
     for s in range(len(samples)):
         sample = samples[s]
         u, v, _ = pixel(before, sample[X], sample[Y], sample[Z])
-        out[s] = shutter * abs((sample[U] - u) * sample[NX] + (sample[V] - v) * sample[NY])
+        out[s] = _SHUTTER * abs((sample[U] - u) * sample[NX] + (sample[V] - v) * sample[NY])
 
 
 @numba.njit(nogil=True, cache=True)
@@ -118,8 +117,6 @@ def search_creases(
     own_labels: NDArray[np.uint8],
     other_labels: NDArray[np.uint8],
     reach_px: float,
-    contrast: float,
-    weight: float,
     out: Array,
     clearness: Array,
 ) -> None:
@@ -128,10 +125,7 @@ def search_creases(
     Both crowns have the same colours. Shading may darken both towards the line, but gradually; the edge is sharp except
     for lens blur.
 
-    Args:
-        contrast: minimum difference between the brighter tooth and the line [8-bit steps].
-        weight: weight of the edges found [-].
-        Other arguments are those of `edges.search_borders`; only samples without a border are processed.
+    Arguments are those of `edges.search_borders`; only samples without a border are processed.
     """
     reach = min(reach_px, _CREASE_PX)
     n = 2 * int(reach + _BESIDE_PX) + _CREASE_ARM
@@ -155,13 +149,13 @@ def search_creases(
                 low, at = p, k
         least = line[at]
         before, behind = line[max(at - 8, 0)], line[min(at + 8, 2 * n)]
-        if max(before, behind) - least < contrast or min(before, behind) - least < 0.4 * contrast:
+        if max(before, behind) - least < _CREASE_CONTRAST or min(before, behind) - least < 0.4 * _CREASE_CONTRAST:
             continue
         first, last = max(at - int(2 * _BESIDE_PX), _CREASE_ARM), min(at + int(2 * _BESIDE_PX), 2 * n - _CREASE_ARM)
         place = steepest(line, first, last, _CREASE_ARM, False, 0)
         if not np.isnan(place) and abs(place - n) <= 2 * reach:
             out[s] = 0.5 * (place - n)
-            clearness[s] = weight
+            clearness[s] = _CREASE_WEIGHT
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,14 +196,13 @@ class RegionView:
         tables, blur_px = np.empty(len(samples), np.int64), np.empty(len(samples))
         distances, clearness = np.empty(len(samples)), np.empty(len(samples))
         choose_tables(samples, count, drawn.own, self.axes, self.patches[arch], tables)
-        measure_blur(samples, self.before[arch], _SHUTTER, blur_px)
+        measure_blur(samples, self.before[arch], blur_px)
         both = (drawn.own, drawn.other, drawn.other_inverse_depth)
-        search_borders(samples, tables, self.bins, self.ratio[arch], *both, *limits, _CLEAR_RATIO, distances, clearness)
+        search_borders(samples, tables, self.bins, self.ratio[arch], *both, *limits, distances, clearness)
         if limits[0] <= _SHARPEN_PX:
-            sharpen(samples, self.rgb, _CONTRAST, _SHARP_REACH_PX, blur_px, distances, clearness)
+            sharpen(samples, self.rgb, blur_px, distances, clearness)
         if limits[0] <= _CREASE_REACH_PX:
-            crease = (_CREASE_CONTRAST, _CREASE_WEIGHT)
-            search_creases(samples, self.rgb, drawn.own, drawn.other, limits[0], *crease, distances, clearness)
+            search_creases(samples, self.rgb, drawn.own, drawn.other, limits[0], distances, clearness)
         if self.counts is not None:
             self._count(self.counts, arch, samples, tables, distances, clearness, drawn)
             clearness /= 1.0 + (blur_px / _BLURRED_PX) ** 2
