@@ -71,7 +71,7 @@ class Bench:
     def aligned(self, poses: np.ndarray, frame: int) -> np.ndarray:
         """Return the poses as tracking would begin with them; raises TrackingError where it would not."""
         with self.footage.views(poses[0, :3, 3], self.solver.config.working_px_per_mm) as masks:
-            return first_record(self.solver, self.solver.config, poses, masks.at(frame), frame).solution.poses
+            return first_record(self.solver, poses, masks.at(frame), frame).solution.poses
 
 
 def seen(bench: Bench, truth: np.ndarray, view: View) -> list[np.ndarray]:

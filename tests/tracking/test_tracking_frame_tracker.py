@@ -40,7 +40,7 @@ def tracker():
     bare, total = uncovered_px(SCANS, solution.poses, views)
     history = History(CONFIG.history_frames, CONFIG.score_frames)
     history.add(FrameRecord(solution, np.full(2, TRACKED, np.int8), np.ones((2, 3), bool), bare / total))
-    return FrameTracker(solver, CONFIG, history)
+    return FrameTracker(solver, history)
 
 
 def _errors(record):
@@ -156,7 +156,7 @@ def test_a_mask_is_wrong_if_its_penalty_exceeds_its_matched_contour(tracker, unc
     ],
 )
 def test_every_check_reports_its_value_and_limit(tracker, reason, limits, words):
-    strict = FrameTracker(ContourSolver(SCANS, CONFIG), replace(CONFIG, **limits), tracker.history)
+    strict = FrameTracker(ContourSolver(SCANS, replace(CONFIG, **limits)), tracker.history)
     views = _views(1)
     for view in views:
         view.masks[:, 2, 2] = 255  # every mask has a pixel that no scan covers

@@ -102,9 +102,9 @@ def test_a_poor_start_is_an_error_if_undoing_a_mistake_gives_a_clear_one(footage
 def test_wrong_minimum_that_covers_the_masks_is_refused(footage):
     solver, poses = ContourSolver(SCANS, TrackingConfig()), jaw_poses(FRAMES)[0]
     with footage.views(poses[0, :3, 3], 7.2) as masks:
-        assert first_record(solver, solver.config, poses, masks.at(FIRST), FIRST).solution.poses.shape == (2, 4, 4)
+        assert first_record(solver, poses, masks.at(FIRST), FIRST).solution.poses.shape == (2, 4, 4)
         with pytest.raises(TrackingError, match="upper teeth do not fit their masks") as refusal:
-            first_record(solver, solver.config, _misplaced(poses), masks.at(FIRST), FIRST)
+            first_record(solver, _misplaced(poses), masks.at(FIRST), FIRST)
     share, fit = re.findall(r"(-?[\d.]+)%? (?:of the visible|\(at least 0.03)", str(refusal.value))
     assert float(share) > 15 and float(fit) < 0  # the first alone is not conclusive
 
@@ -112,7 +112,7 @@ def test_wrong_minimum_that_covers_the_masks_is_refused(footage):
 def test_a_wrong_minimum_is_escaped_by_excluding_the_uncovered_mask(footage):
     solver, poses = ContourSolver(SCANS, TrackingConfig()), jaw_poses(FRAMES)[0]
     with footage.views(poses[0, :3, 3], 7.2) as masks:
-        record = first_record(solver, solver.config, _misplaced(poses, 0.35), masks.at(FIRST), FIRST)
+        record = first_record(solver, _misplaced(poses, 0.35), masks.at(FIRST), FIRST)
     assert record.used.all()
     for r in (0, 1):
         assert vertex_error_mm(MESHES[r], record.solution.poses[r], poses[r]) < 0.05

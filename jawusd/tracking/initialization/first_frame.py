@@ -37,12 +37,7 @@ FIRST_ROUNDS = 3
 
 
 def first_record(
-    solver: ContourSolver,
-    config: TrackingConfig,
-    start: Array,
-    views: Sequence[View],
-    frame: int,
-    explain: bool = False,
+    solver: ContourSolver, start: Array, views: Sequence[View], frame: int, explain: bool = False
 ) -> FrameRecord:
     """Align the first frame from its views, starting from given T_world_upper and T_world_lower, shape (2, 4, 4).
 
@@ -51,7 +46,7 @@ def first_record(
     Raises:
         TrackingError: too few masks on this frame, or the alignment failed.
     """
-    use = present_masks(views)
+    use, config = present_masks(views), solver.config
     for r in ARCHES:
         if use[r].sum() < FEWEST_MASKS:
             raise TrackingError(
@@ -59,14 +54,14 @@ def first_record(
                 frame=frame,
                 hint="Choose a bootstrap frame that is segmented in every camera.",
             )
-    first = _aligned(solver, config, start, views, use)
+    first = _aligned(solver, start, views, use)
     if (problem := _problem(first, config)) is not None:
         # Wrong masks of one camera (another position, size or time) may have biased all poses.
         kept = [_without(use, np.arange(len(views)) == c) for c in range(len(views))]
-        others = [_aligned(solver, config, start, views, rest) for rest in kept]
+        others = [_aligned(solver, start, views, rest) for rest in kept]
         clear = [one for one in others if one.fit.min() >= CLEAR_FIT and _problem(one, config) is None]
         if not clear:
-            if explain and (cause := _wrong_size(solver, config, start, views)) is not None:
+            if explain and (cause := _wrong_size(solver, start, views)) is not None:
                 raise TrackingError(cause, frame=frame, hint=_SIZE_HINT)
             raise TrackingError(
                 problem,
@@ -88,9 +83,9 @@ class _Aligned:
     fit: Array  # `arch_fit` of both arches, shape (2,)
 
 
-def _aligned(solver: ContourSolver, config: TrackingConfig, start: Array, views: Sequence[View], use: Mask) -> _Aligned:
+def _aligned(solver: ContourSolver, start: Array, views: Sequence[View], use: Mask) -> _Aligned:
     """Align both arches with narrow and with wide residual gates, then exclude masks that the scans do not cover."""
-    whole = use
+    whole, config = use, solver.config
     best = solver.solve(start, views, config.gates_from(0.0), use)
     wide = solver.solve(start, views, config.wide_gates_px, use)
     if (better := score_px(wide).sum(1) > score_px(best).sum(1)).any():
@@ -121,9 +116,9 @@ def _problem(first: _Aligned, config: TrackingConfig) -> str | None:
     return None
 
 
-def _wrong_size(solver: ContourSolver, config: TrackingConfig, start: Array, views: Sequence[View]) -> str | None:
+def _wrong_size(solver: ContourSolver, start: Array, views: Sequence[View]) -> str | None:
     """Return a message about a camera whose magnification explains a failed alignment; None without such a camera."""
-    use = present_masks(views)
+    use, config = present_masks(views), solver.config
     poses = solver.solve(start, views, config.wide_gates_px, use).poses
     scales = np.zeros(len(views))
     for _ in range(_SIZE_ROUNDS):
@@ -134,7 +129,7 @@ def _wrong_size(solver: ContourSolver, config: TrackingConfig, start: Array, vie
         own = found.scale - found.common
         scales = scales + np.where(np.abs(own) > _OWN_SCALE, own, 0.0)
         grown = [magnified(view, 1.0 + scale) for view, scale in zip(views, scales, strict=True)]
-        again = _aligned(solver, config, poses, grown, use)
+        again = _aligned(solver, poses, grown, use)
         poses = again.solution.poses
     if np.abs(scales).max() > _LEAST_SCALE and _problem(again, config) is None and again.fit.min() >= CLEAR_FIT:
         worst = int(np.abs(scales).argmax())

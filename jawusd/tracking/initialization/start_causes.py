@@ -136,7 +136,7 @@ def aligned(search: StartSearch, footage: Footage, poses: Array, frame: int) -> 
     """
     solver = search.solver
     with footage.views(teeth_centre(solver.scans, poses), solver.config.working_px_per_mm) as masks:
-        return first_record(solver, solver.config, poses, masks.at(frame), frame).solution.poses
+        return first_record(solver, poses, masks.at(frame), frame).solution.poses
 
 
 def raise_cause(

@@ -11,7 +11,6 @@ import numpy as np
 from jawusd.base.arrays import Array, Mask
 from jawusd.formats.tracks import LOST, PARTIAL, RECOVERED, TRACKED, LostReason
 from jawusd.geometry import transform_point
-from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.contour.equations import Solution, motion_about, translation
 from jawusd.tracking.contour.frame_record import NO_LOSS, FrameRecord, Loss
 from jawusd.tracking.contour.quality import (
@@ -62,10 +61,8 @@ class _Instant:
 class FrameTracker:
     """Tracks frames from predictions, with increasingly expensive attempts while an alignment looks wrong."""
 
-    def __init__(self, solver: ContourSolver, config: TrackingConfig, history: History) -> None:
-        self._solver = solver
-        self._config = config
-        self.history = history
+    def __init__(self, solver: ContourSolver, history: History) -> None:
+        self._solver, self._config, self.history = solver, solver.config, history
         self.searched = False  # whether the multi-start search ran on the last frame
 
     def track(

@@ -45,12 +45,12 @@ class GuidedTracker:
     ) -> None:
         """Prepare the scans, in one coordinate frame and in occlusion [mm]; errors are those of `prepare_scan`.
 
-        In each of `rounds`, `see` generates the masks of a frame, which tend to confirm the poses, and poses follow.
+        `see` generates the masks of a frame around its poses, which they tend to confirm; the poses are then aligned
+        with the masks, `rounds` times.
         """
-        self._config = config or FOR_AUTO_MASKS
         self._vertices = upper.vertices, lower.vertices
         scans = prepare_scan(upper, "upper"), prepare_scan(lower, "lower")
-        self._solver = ContourSolver(scans, self._config, executor)
+        self._solver = ContourSolver(scans, config or FOR_AUTO_MASKS, executor)
         self._see, self._rounds = see, rounds
 
     @property
@@ -75,7 +75,7 @@ class GuidedTracker:
         """Align the first frame from picked poses; raises TrackingError if the teeth do not fit the views."""
         for turn in range(FIRST_ROUNDS):
             views = self._see(frame, poses, min(turn, self._rounds - 1))
-            record = first_record(self._solver, self._config, poses, views, frame)
+            record = first_record(self._solver, poses, views, frame)
             poses = record.solution.poses
         return record
 
@@ -89,10 +89,10 @@ class GuidedTracker:
             guide: poses by frame, as found by colour, shape (2, 4, 4).
             past: summaries of the frames tracked before, from the first aligned frame to the neighbour of `frames`.
         """
-        history = History(self._config.history_frames, self._config.score_frames)
+        history = History(self._solver.config.history_frames, self._solver.config.score_frames)
         for before in past:
             history.add_summary(before)
-        tracker = FrameTracker(self._solver, self._config, history)
+        tracker = FrameTracker(self._solver, history)
         for frame in frames:
             self._solver.forget_drawings()  # makes the poses of resumed runs the same as those of uninterrupted runs
             start = guide[frame]

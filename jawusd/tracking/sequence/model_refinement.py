@@ -174,7 +174,7 @@ def refine_tracks(
         ThreadPoolExecutor(threads) as pool,
     ):
         solver = ContourSolver(scans, config, pool if threads > 1 else None)
-        second = _SecondPass(solver, config, prior, tracks)
+        second = _SecondPass(solver, prior, tracks)
         for done, k in enumerate(hard.tolist(), start=1):
             views = _corrected_views(masks.at(int(tracks.frames[k])), tracks, k, starts)
             refined = second.align(k, starts[k], views)
@@ -196,8 +196,8 @@ class _Refined:
 class _SecondPass:
     """Aligns single frames with the prior, and rejects results that do not fit the masks."""
 
-    def __init__(self, solver: ContourSolver, config: TrackingConfig, prior: KinematicPrior, tracks: Tracks) -> None:
-        self._solver, self._config, self._prior, self._tracks = solver, config, prior, tracks
+    def __init__(self, solver: ContourSolver, prior: KinematicPrior, tracks: Tracks) -> None:
+        self._solver, self._config, self._prior, self._tracks = solver, solver.config, prior, tracks
         self._usual_px = np.nanmedian(np.where(tracks.status == TRACKED, tracks.residual_px, np.nan), axis=0)
         self._correlation_px = float(tracks.meta["correlation_px"])
         self._outline_weight = 1.0 / (self._usual_px**2 * self._correlation_px)

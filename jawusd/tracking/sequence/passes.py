@@ -12,7 +12,6 @@ from jawusd.base.arrays import Array
 from jawusd.base.errors import TrackingError
 from jawusd.formats.tracks import LOST, RECOVERED, TRACKED, LostReason
 from jawusd.geometry import relative_pose, transform_points
-from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.contour.frame_record import FrameRecord, Loss, PackedRecords
 from jawusd.tracking.contour.quality import fitting_share, residual_px, score_px
 from jawusd.tracking.contour.scan import ARCHES, probe_points
@@ -93,15 +92,9 @@ class Passes:
     """Tracks the frames of a take, and stores one record per frame."""
 
     def __init__(
-        self,
-        solver: ContourSolver,
-        config: TrackingConfig,
-        masks: MaskViews,
-        first: int,
-        stop: int,
-        progress: Progress | None,
+        self, solver: ContourSolver, masks: MaskViews, first: int, stop: int, progress: Progress | None
     ) -> None:
-        self._solver, self._config, self._masks = solver, config, masks
+        self._solver, self._config, self._masks = solver, solver.config, masks
         self._first, self._stop = first, stop
         self._progress = progress or (lambda done, total: None)
         self._probes = probe_points(solver.scans)
@@ -158,7 +151,7 @@ class Passes:
 
     def begin(self, frame: int, poses: Array) -> FrameRecord:
         """Align the first frame."""
-        return first_record(self._solver, self._config, poses, self._masks.at(frame), frame, True)
+        return first_record(self._solver, poses, self._masks.at(frame), frame, True)
 
     def judge_first(self, take: TwoWays[FrameRecord], first: int) -> None:
         """Track from the nearest frame with a good fit back to the first frame, and beyond it until the poses agree.
@@ -177,7 +170,7 @@ class Passes:
         history = History(self._config.history_frames, self._config.score_frames)
         for near in self._around(frame, without)[-self._config.history_frames :]:
             history.add(self.records[near])
-        return FrameTracker(self._solver, self._config, history)
+        return FrameTracker(self._solver, history)
 
     def _around(self, frame: int, without: Container[int]) -> list[int]:
         """Return the tracked frames around a frame, the nearest ones last."""

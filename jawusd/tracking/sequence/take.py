@@ -83,7 +83,7 @@ def track_capture(
         centre = teeth_centre(scans, start.poses)
         with MaskViews(capture.cameras, table, offsets, centre, config.working_px_per_mm) as masks:
             first, stop = capture.frames or masks.frames
-            take = _Take(solver, config, masks, first, stop, progress)
+            take = _Take(solver, masks, first, stop, progress)
             footage = Footage(masked_sources(capture.cameras, table, offsets), table, offsets, capture.frames)
             lost = LostSearch(lambda: StartSearch((upper, lower), solver, start.T_anatomical_scan, pool.map), footage)
             with quote_findings(start.findings):
