@@ -80,7 +80,7 @@ def calibrate_detections(
     scans: Mapping[str, Array],
     scale_without_picks: MeasureScale | None = None,
 ) -> tuple[list[Camera], CalibrationNotes]:
-    """Calibrate the cameras from detected corners; arguments and errors (CalibrationError) as `calibrate_capture`."""
+    """Calibrate the cameras from detected corners; arguments and CalibrationError as for `calibrate_capture`."""
     boards = capture.boards
     if boards is None:
         raise CalibrationError("has no [boards] table.", path=capture.file)

@@ -43,7 +43,7 @@ class Scene:
     def cut(
         self, config: SegmentationConfig, reach_mm: float, seeds: Seeds | None = None
     ) -> tuple[NDArray[np.float32], Mask]:
-        """Return the coverage of both arches (2, h, w), cut, refined and annotated, and visible borders (h, w)."""
+        """Return the coverage of both arches (2, h, w), with annotated pixels kept, and pixels with visible borders."""
         rgb, expected, px_per_mm = self.window.rgb, self.expected, self.px_per_mm
         shares = cut_arches(rgb, expected, self.colours, config, px_per_mm, reach_mm, seeds)
         shares, clear = refine_borders(shares, rgb, config, px_per_mm)
@@ -121,7 +121,7 @@ class CameraSegmenter:
     ) -> Segment | None:
         """Segment a recorded RGB image (H, W, 3); None if the teeth are out of view.
 
-        Poses (2, 4, 4) are predicted in iteration 0, and refined in the next ones; `turn` is its number.
+        `turn` is the number of the iteration: 0 with predicted poses (2, 4, 4), 1 or more with refined ones.
         """
         c = self._config
         scene = self._scene(image, poses)

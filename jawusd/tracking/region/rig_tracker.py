@@ -96,7 +96,7 @@ class RigTracker:
     def begin(self, cut: Cut, pose: Pose, *, searched: bool = False) -> FrameFit:
         """Learn colours from a first frame near a pose; return the frame fit.
 
-        With one camera, other poses than one that was `searched` are tried if it hardly fits.
+        With one camera, other poses are tried as well if the pose was `searched` and hardly fits.
         """
         begun = self._begun(cut, pose, 1.0)
         alone = begun.look.use.any(axis=0).sum() == 1
