@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import threading
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -17,7 +16,7 @@ from jawusd.base.arrays import Array
 from jawusd.base.errors import FormatError, explain_missing_packages, naming_file
 from jawusd.formats.capture import Bootstrap, Capture
 from jawusd.formats.capture_writing import write_bootstrap
-from jawusd.formats.mesh import Mesh, crown_face_mask, tooth_labels
+from jawusd.formats.mesh import Mesh
 from jawusd.formats.tracks import Tracks, load_tracks
 from jawusd.geometry import Camera
 from jawusd.pipeline.calibrate import sync_cameras
@@ -31,15 +30,13 @@ from jawusd.pipeline.view import CAPTURE_FILE
 from jawusd.pipeline.workspace import open_capture
 
 if TYPE_CHECKING:
-    from jawusd.media.overlay import Backdrop, PlacedScan
+    from jawusd.media.overlay import Backdrop
     from jawusd.media.side_by_side import CameraWall
-    from jawusd.viewer.viewed import Look, ViewedCapture, ViewedFootage
+    from jawusd.viewer.viewed import ViewedCapture, ViewedFootage
 
 
 _TRACKS = "tracks.npz"
-_SPECKS_PERCENT = 0.5
 _TILE_PX = (480, 360)  # maximum size of a camera's tile; three tiles fill the width of the page
-_FILL: dict[Look, float] = {"outlines": 0.0, "tinted": 0.3}
 
 
 def viewed_capture(
@@ -74,26 +71,19 @@ def viewed_capture(
     backdrops = open_backdrops(capture, offsets)
     by_name = {camera.name: camera for camera in cameras}
     scans = {arch: meshes[f"{arch}_teeth"] for arch in ("upper", "lower")}
-    wall = CameraWall(by_name, backdrops, poses, tuple(scans.values()), _tile_px(backdrops, poses is not None))
-    footage = _Footage(capture, backdrops, wall, by_name, offsets, scans, poses)
     return ViewedCapture(
-        name=capture.name,
-        fps=capture.fps,
+        source=capture,
         frames=_frames(capture, poses, backdrops, offsets),
         offsets=offsets,
-        sizes_px={name: backdrop.size_px for name, backdrop in backdrops.items()},
+        backdrops=backdrops,
+        all_cameras=CameraWall(
+            by_name, backdrops, poses, tuple(scans.values()), _tile_px(backdrops, poses is not None)
+        ),
         cameras=by_name,
         scans=scans,
-        crowns={arch: crown_face_mask(mesh) for arch, mesh in scans.items()},
-        labels={arch: tooth_labels(mesh) if mesh.labels is None else mesh.labels for arch, mesh in scans.items()},
         T_anatomical_skull=subject_of_capture(capture, meshes).T_anatomical_skull,
         tracks=poses,
-        picks=capture.bootstrap,
-        picture=footage.picture,
-        wall=footage.picture_of_all,
-        wall_px=wall.size_px,
-        teeth_region=footage.teeth_region,
-        poses_of_picks=footage.poses_of_picks,
+        poses_of_picks=partial(_poses_of_picks, scans, by_name),
         save_picks=partial(write_bootstrap, path / CAPTURE_FILE if path.is_dir() else path),
         save_labels=partial(save_reviewed, own_scans, scans),
     )
@@ -135,80 +125,15 @@ def _frames(
     return max(0, min(offsets[name] for name in backdrops)), last
 
 
-@dataclass(frozen=True, eq=False)
-class _Footage:
-    """Provides the images, teeth regions and poses of a capture for the pages of the viewer; thread-safe."""
+def _poses_of_picks(
+    scans: Mapping[str, Mesh], cameras: Mapping[str, Camera], picks: Bootstrap
+) -> tuple[tuple[Array, Array], list[str]]:
+    """Return the poses estimated from picks, and the names of outlier picks."""
+    from jawusd.tracking.initialization.bootstrap import pose_from_picks
 
-    capture: Capture
-    backdrops: Mapping[str, Backdrop]
-    wall: CameraWall
-    cameras: Mapping[str, Camera]
-    offsets: Mapping[str, int]
-    scans: Mapping[str, Mesh]
-    tracks: Tracks | None
-
-    def picture(self, name: str, frame: int, poses: tuple[Array, Array] | None, look: Look) -> NDArray[np.uint8]:
-        """Return a camera's image at a frame of the reference camera, with the teeth drawn over it."""
-        from jawusd.media.overlay import EMPTY_GRAY, draw_overlay
-
-        image = self.backdrops[name].picture(frame)
-        if image is None:
-            width, height = self.backdrops[name].size_px
-            return np.full((height, width, 3), EMPTY_GRAY, np.uint8)
-        placed = self._placed(frame, poses, look)
-        if not placed or name not in self.cameras:
-            return image
-        return draw_overlay(image, self.cameras[name], placed, fill=_FILL[look])
-
-    def picture_of_all(
-        self,
-        frame: int,
-        poses: tuple[Array, Array] | None,
-        look: Look,
-        partly: Callable[[NDArray[np.uint8]], None] | None = None,
-    ) -> NDArray[np.uint8]:
-        """Return all cameras' images side by side, with the teeth drawn over them; `partly` as in `CameraWall.draw`."""
-        return self.wall.draw(frame, self._placed(frame, poses, look), fill=_FILL.get(look, 0.0), partly=partly)
-
-    def _placed(self, frame: int, poses: tuple[Array, Array] | None, look: Look) -> list[PlacedScan]:
-        from jawusd.media.overlay import LOWER_COLOUR, UPPER_COLOUR, PlacedScan, arch_colours
-
-        if poses is None or look == "footage":
-            return []
-        row = None if self.tracks is None else self.tracks.row_of(frame)
-        colours = (UPPER_COLOUR, LOWER_COLOUR) if self.tracks is None or row is None else arch_colours(self.tracks, row)
-        return [PlacedScan(*scan) for scan in zip(self.scans.values(), poses, colours, strict=True)]
-
-    def teeth_region(self, name: str, frame: int) -> tuple[float, float, float, float] | None:
-        """Return left, top, right and bottom [px] of the region covered by a camera's masks in a frame, or None."""
-        from jawusd.media.masks import open_masks
-
-        source = next(camera for camera in self.capture.cameras if camera.name == name)
-        if source.masks is None:
-            return None
-        seen = []
-        for reader in open_masks(source, self.backdrops[name].size_px):
-            with reader as masks:
-                mask = masks.read(frame - self.offsets[name])
-            if mask is not None:
-                y, x = np.nonzero(mask > 127)
-                seen.append(np.column_stack([x, y]))
-        if not any(map(len, seen)):
-            return None
-        # Percentiles ignore specks far from the teeth.
-        low, high = np.percentile(np.vstack(seen), (_SPECKS_PERCENT, 100 - _SPECKS_PERCENT), axis=0)
-        return float(low[0]), float(low[1]), float(high[0]), float(high[1])
-
-    def poses_of_picks(self, picks: Bootstrap) -> tuple[tuple[Array, Array], list[str]]:
-        """Return the poses estimated from picks, and the names of outlier picks."""
-        from jawusd.tracking.initialization.bootstrap import pose_from_picks
-
-        poses, wrong = [], []
-        for arch, mesh in self.scans.items():
-            pose, bad = pose_from_picks(getattr(picks, arch), mesh.vertices, self.cameras, arch)
-            poses.append(pose)
-            wrong += [f"{arch[0].upper()}{number}" for number in bad]
-        return (poses[0], poses[1]), wrong
+    upper, lower = (pose_from_picks(getattr(picks, arch), mesh.vertices, cameras, arch) for arch, mesh in scans.items())
+    wrong = [f"{arch}{number}" for arch, (_, bad) in (("U", upper), ("L", lower)) for number in bad]
+    return (upper[0], lower[0]), wrong
 
 
 def take_footage(folder: Path, tile_px: tuple[int, int] = _TILE_PX) -> ViewedFootage | None:

@@ -39,7 +39,7 @@ class CapturePage:
     def __init__(self, client: viser.ClientHandle, capture: ViewedCapture) -> None:
         self.client, self._capture = client, capture
         gui = client.gui
-        begin_panel(client, capture.name)
+        begin_panel(client, capture.source.name)
         self.scene = CaptureScene(client, capture)
         self.layout: PickingLayout | None = None
         self.poses: dict[str, Array] = {}
@@ -186,8 +186,8 @@ class CapturePage:
         """Return the layout of one camera's image, or of all cameras side by side."""
         capture = self._capture
         if view not in capture.sizes_px:
-            width, height = capture.wall_px
-            return PickingLayout(capture.wall_px, (0.0, 0.0, width - 1.0, height - 1.0))
+            width, height = capture.all_cameras.size_px
+            return PickingLayout((width, height), (0.0, 0.0, width - 1.0, height - 1.0))
         return PickingLayout(capture.sizes_px[view], self._region(view, frame))
 
     def _region(self, camera: str, frame: int) -> Region:
@@ -266,7 +266,7 @@ class CaptureViewer(PageServer):
 
     def __init__(self, capture: ViewedCapture, host: str, port: int) -> None:
         self._capture = capture
-        super().__init__(capture.name, host, port)
+        super().__init__(capture.source.name, host, port)
         set_first_view(self._server)
 
     async def _page(self, client: viser.ClientHandle) -> CapturePage:

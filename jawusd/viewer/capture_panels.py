@@ -42,9 +42,11 @@ class FootagePanel:
         self._client, self._capture, self._turned, self._changed = client, capture, turned, changed
         self._loading = False
         self.view = next(iter(capture.sizes_px))
-        self.frame = capture.picks.frame if capture.tracks is None and capture.picks else capture.frames[0]
+        self.frame = (
+            capture.source.bootstrap.frame if capture.tracks is None and capture.source.bootstrap else capture.frames[0]
+        )
         self.frame = min(max(self.frame, capture.frames[0]), capture.frames[1])
-        self.worst = [] if capture.tracks is None else frames_to_inspect(capture.tracks, capture.fps)
+        self.worst = [] if capture.tracks is None else frames_to_inspect(capture.tracks, capture.source.fps)
         gui = client.gui
         views = (
             *capture.sizes_px,
@@ -121,7 +123,7 @@ class FootagePanel:
     def _show(self, frame: int) -> None:
         assign(self.slider, frame)
         capture = self._capture
-        lines = [f"<b>{self.view}</b>, frame {frame}, {frame / capture.fps:.2f} s"]
+        lines = [f"<b>{self.view}</b>, frame {frame}, {frame / capture.source.fps:.2f} s"]
         if self.view in capture.offsets and (own := frame - capture.offsets[self.view]) != frame:
             lines[0] += f" (frame {own} of this camera)"
         if capture.tracks is not None:
@@ -147,7 +149,7 @@ class FootagePanel:
         self.play.label, self.play.icon = "pause", viser.Icon.PLAYER_PAUSE
         first, last = self._capture.frames
         span = float(first), float(max(last, first + 1))
-        self.player.start(float(self.frame), self._capture.fps, span, lambda: bool(self.loop.value))
+        self.player.start(float(self.frame), self._capture.source.fps, span, lambda: bool(self.loop.value))
 
     def _play_to(self, frame: float) -> None:
         """Show the frame at a playback time; if the page cannot draw every frame, some are skipped."""
@@ -184,8 +186,8 @@ class PicksPanel:
         """Add the widgets to the current container; call `turned` if the side changes, else `changed`."""
         self._client, self._capture, self._footage = client, capture, footage
         self._turned, self._changed = turned, changed
-        self.book, self.side = PickBook(capture.picks), "front"
-        self._saved, self.scans_shown = capture.picks, False
+        self.book, self.side = PickBook(capture.source.bootstrap), "front"
+        self._saved, self.scans_shown = capture.source.bootstrap, False
         self._fit = ""
         gui = client.gui
         gui.add_html(small_text(_HELP))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -12,12 +13,14 @@ from numpy.typing import NDArray
 
 from jawusd.base.arrays import Array, Mask
 from jawusd.evaluator import JawRig
-from jawusd.formats.mesh import Mesh
+from jawusd.formats.mesh import Mesh, crown_face_mask, tooth_labels
 
 if TYPE_CHECKING:  # pages of rigs need no captures, which take a tenth of a second to import
-    from jawusd.formats.capture import Bootstrap
+    from jawusd.formats.capture import Bootstrap, Capture
     from jawusd.formats.tracks import Tracks
     from jawusd.geometry import Camera
+    from jawusd.media.overlay import Backdrop, PlacedScan
+    from jawusd.media.side_by_side import CameraWall
     from jawusd.viewer.motion import Clip
 
 #: Names of the fixed meshes (skull frame) and of the moving meshes (mandible frame).
@@ -64,42 +67,99 @@ class ViewedActor:
     footage: ViewedFootage | None = None  # None if the capture is not available
 
 
+_SPECKS_PERCENT = 0.5  # percentage of mask pixels on each side that may lie far from the teeth
+_FILL: dict[Look, float] = {"outlines": 0.0, "tinted": 0.3}  # opacity of the teeth
+
+
 @dataclass(frozen=True, eq=False)
 class ViewedCapture:
-    """A capture to view."""
+    """A capture to view; any thread may call the methods. Poses are T_world_upper and T_world_lower."""
 
-    name: str
-    fps: float
+    source: Capture  # with the calibration and the labels of the build whose poses are shown
     frames: tuple[int, int]  # first and last frame (inclusive) of the reference camera to step through
     offsets: Mapping[str, int]  # frame k of a camera is simultaneous with frame k + offset of the reference camera
-    # (width, height) of the images of every camera with footage, in the capture's order
-    sizes_px: Mapping[str, tuple[int, int]]
+    backdrops: Mapping[str, Backdrop]  # images of every camera with footage or masks, in the capture's order
+    all_cameras: CameraWall  # the same images side by side
     cameras: Mapping[str, Camera]  # calibrated cameras by name; empty without a calibration
     scans: Mapping[str, Mesh]  # by arch, "upper" and "lower": vertices in the order and coordinates [mm] of the files
-    crowns: Mapping[str, Mask]  # by arch: which faces of a scan are teeth, shape (F,); the others are gum
-    labels: Mapping[str, NDArray[np.uint8]]  # by arch: GUM, TOOTH, BOUNDARY or BASE per vertex, shape (V,)
     T_anatomical_skull: Array  # scan frame to anatomical frame, shape (4, 4)
     tracks: Tracks | None  # tracked poses, if any
-    picks: Bootstrap | None  # picks of the capture file, if any
-    # maps (camera, frame of the reference camera, T_world_upper and T_world_lower or None, look) to RGB (h, w, 3)
-    # uint8, gray if the camera has no image; raises a JawusdError
-    picture: Callable[[str, int, tuple[Array, Array] | None, Look], NDArray[np.uint8]]
-    # like `picture`, for all cameras side by side in an image of `wall_px`; the last argument is called with partial
-    # images while cameras are being decoded
-    wall: Callable[
-        [int, tuple[Array, Array] | None, Look, Callable[[NDArray[np.uint8]], None] | None], NDArray[np.uint8]
-    ]
-    wall_px: tuple[int, int]
-    # maps (camera, frame) to the region of the teeth in the camera's masks; None without masks
-    teeth_region: Callable[[str, int], Region | None]
-    # fits T_world_upper and T_world_lower (4, 4) to picks, and returns them with the names of inconsistent picks;
-    # raises a JawusdError
+    # fits poses (4, 4) to picks, and returns them with the names of inconsistent picks; raises a JawusdError
     poses_of_picks: Callable[[Bootstrap], tuple[tuple[Array, Array], list[str]]]
     # writes the new picks (first argument) to the capture file if it still has the expected old picks (second
     # argument); otherwise raises a JawusdError
     save_picks: Callable[[Bootstrap, Bootstrap | None], None]
     # writes the approved labels of an arch and returns the file; raises a JawusdError
     save_labels: Callable[[str, NDArray[np.uint8]], Path]
+
+    @cached_property
+    def sizes_px(self) -> dict[str, tuple[int, int]]:
+        """Return (width, height) of the images of every camera with footage or masks."""
+        return {name: backdrop.size_px for name, backdrop in self.backdrops.items()}
+
+    @cached_property
+    def crowns(self) -> dict[str, Mask]:
+        """Return by arch which faces of a scan are teeth, shape (F,); the others are gum."""
+        return {arch: crown_face_mask(mesh) for arch, mesh in self.scans.items()}
+
+    @cached_property
+    def labels(self) -> dict[str, NDArray[np.uint8]]:
+        """Return GUM, TOOTH, BOUNDARY or BASE of every vertex by arch, shape (V,)."""
+        return {arch: tooth_labels(mesh) if mesh.labels is None else mesh.labels for arch, mesh in self.scans.items()}
+
+    def picture(self, name: str, frame: int, poses: tuple[Array, Array] | None, look: Look) -> NDArray[np.uint8]:
+        """Return a camera's image at a frame of the reference camera, RGB (h, w, 3), with the teeth drawn over it.
+
+        It is gray if the camera has no image of that frame; raises a JawusdError.
+        """
+        from jawusd.media.overlay import EMPTY_GRAY, draw_overlay
+
+        image = self.backdrops[name].picture(frame)
+        if image is None:
+            width, height = self.sizes_px[name]
+            return np.full((height, width, 3), EMPTY_GRAY, np.uint8)
+        placed = self._placed(frame, poses, look)
+        if not placed or name not in self.cameras:
+            return image
+        return draw_overlay(image, self.cameras[name], placed, fill=_FILL[look])
+
+    def wall(
+        self,
+        frame: int,
+        poses: tuple[Array, Array] | None,
+        look: Look,
+        partly: Callable[[NDArray[np.uint8]], None] | None = None,
+    ) -> NDArray[np.uint8]:
+        """Return all cameras' images side by side, as `picture` does; `partly` as in `CameraWall.draw`."""
+        return self.all_cameras.draw(frame, self._placed(frame, poses, look), fill=_FILL.get(look, 0.0), partly=partly)
+
+    def _placed(self, frame: int, poses: tuple[Array, Array] | None, look: Look) -> list[PlacedScan]:
+        from jawusd.media.overlay import LOWER_COLOUR, UPPER_COLOUR, PlacedScan, arch_colours
+
+        if poses is None or look == "footage":
+            return []
+        row = None if self.tracks is None else self.tracks.row_of(frame)
+        colours = (UPPER_COLOUR, LOWER_COLOUR) if self.tracks is None or row is None else arch_colours(self.tracks, row)
+        return [PlacedScan(*scan) for scan in zip(self.scans.values(), poses, colours, strict=True)]
+
+    def teeth_region(self, name: str, frame: int) -> Region | None:
+        """Return the region covered by a camera's masks in a frame, or None."""
+        from jawusd.media.masks import open_masks
+
+        source = next(camera for camera in self.source.cameras if camera.name == name)
+        if source.masks is None:
+            return None
+        seen = []
+        for reader in open_masks(source, self.sizes_px[name]):
+            with reader as masks:
+                mask = masks.read(frame - self.offsets[name])
+            if mask is not None:
+                y, x = np.nonzero(mask > 127)
+                seen.append(np.column_stack([x, y]))
+        if not any(map(len, seen)):
+            return None
+        low, high = np.percentile(np.vstack(seen), (_SPECKS_PERCENT, 100 - _SPECKS_PERCENT), axis=0)
+        return float(low[0]), float(low[1]), float(high[0]), float(high[1])
 
     def tracked_poses(self, frame: int) -> tuple[Array, Array] | None:
         """Return T_world_upper and T_world_lower of a frame, NaN where lost; None if the frame was not tracked."""

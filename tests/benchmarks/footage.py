@@ -51,7 +51,7 @@ def main(capture, tracks):
         "frame before, not seen yet": range(middle - 1, middle - 1 - STEPS, -1),
         "jump": rng.integers(first, last, STEPS).tolist(),
     }
-    print(f"{viewed.name}, {name}, {viewed.sizes_px[name]} px  [ms]   median  p95  max | clock median  p95  max")
+    print(f"{viewed.source.name}, {name}, {viewed.sizes_px[name]} px  [ms]   median  p95  max | clock median  p95  max")
     measures = [(title, show, frames) for title, frames in rows.items()]
     last_read = rows["next frame"][-1]
     measures.append((f"next frame, all {len(viewed.sizes_px)} cameras", show_all, range(last_read, last_read + STEPS)))

@@ -24,6 +24,13 @@ from jawusd.viewer.capture_page import CaptureViewer
 from jawusd.viewer.capture_scene import UP
 
 
+def with_method(viewed, **functions):
+    """Return a copy of a capture to view, with other methods."""
+    changed = replace(viewed)
+    vars(changed).update(functions)
+    return changed
+
+
 @pytest.fixture(scope="module")
 def copy(tmp_path_factory):
     return copy_example(tmp_path_factory.mktemp("viewed") / "capture")
@@ -83,7 +90,7 @@ def test_the_capture_is_read_with_its_poses(viewed):
 
 
 def test_poses_of_picks_are_near_the_truth(viewed):
-    poses, wrong = viewed.poses_of_picks(viewed.picks)
+    poses, wrong = viewed.poses_of_picks(viewed.source.bootstrap)
     known = truth()
     assert wrong == []
     for found, name, arch in zip(poses, ("T_world_upper", "T_world_lower"), ("upper", "lower"), strict=True):
@@ -123,7 +130,7 @@ def test_all_cameras_stand_side_by_side(page):
     footage, capture = page.page.footage, page.page._capture
     page.press(footage.views, "all cameras")
     assert "all cameras" in footage._words.content and "of this camera" not in footage._words.content
-    width, height = capture.wall_px
+    width, height = capture.all_cameras.size_px
     assert page.page.scene._picture.image.shape == (height, width, 3) and page.page.layout.size_px == (width, height)
     drawn, bare = (capture.wall(FIRST, capture.tracked_poses(FIRST), look) for look in ("outlines", "footage"))
     changed = (drawn != bare).any(axis=2)
@@ -141,7 +148,7 @@ def test_all_cameras_stand_side_by_side(page):
 def test_cameras_are_shown_as_they_are_decoded(viewed):
     wall, shown = viewed.wall, []
     held = threading.Event()
-    backdrops = wall.__self__.wall._backdrops
+    backdrops = viewed.backdrops
     late = backdrops["cam1"]
 
     class Late:
@@ -174,7 +181,7 @@ def test_a_picture_that_takes_long_is_said_to_be_loading(viewed):
         held.wait(60)
         return viewed.picture(*given)
 
-    viewer = CaptureViewer(replace(viewed, picture=late), "127.0.0.1", 0)
+    viewer = CaptureViewer(with_method(viewed, picture=late), "127.0.0.1", 0)
     opened = QuietCapturePage(viewer)
     words = opened.page.footage._words
     until(lambda: "loading" in words.content)
@@ -216,7 +223,7 @@ def test_playing_leaves_out_pictures_instead_of_falling_behind(viewed):
         assert partly is None or not opened.page.footage.player.playing
         return viewed.wall(frame, poses, look)
 
-    viewer = CaptureViewer(replace(viewed, wall=slowly), "127.0.0.1", 0)
+    viewer = CaptureViewer(with_method(viewed, wall=slowly), "127.0.0.1", 0)
     opened = QuietCapturePage(viewer)
     opened.settle()
     footage = opened.page.footage

@@ -57,4 +57,4 @@ def test_a_capture_of_masks_alone_is_shown(tmp_path):
     x0, y0, x1, y1 = shown.teeth_region("cam0", 22)
     assert x.min() < x0 + 2 and x.max() > x1 - 2 and y.min() < y0 + 2 and y.max() > y1 - 2
     assert (picture == picture[..., :1]).all()
-    assert shown.wall(22, None, "outlines").shape == (shown.wall_px[1], shown.wall_px[0], 3)
+    assert shown.wall(22, None, "outlines").shape == (*shown.all_cameras.size_px[::-1], 3)

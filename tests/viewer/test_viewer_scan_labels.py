@@ -72,7 +72,7 @@ def test_painted_labels_are_saved_and_used(tmp_path) -> None:
         page.enter(panel.kinds, "gum")
         page.click(transform_point(page.page.poses["upper"], vertices[front]))
         assert panel.brush.changed == {"upper"} and "not saved: upper" in panel._state.content
-        assert not page.page.picks.book.picks or page.page.picks.book.bootstrap() == viewed.picks
+        assert not page.page.picks.book.picks or page.page.picks.book.bootstrap() == viewed.source.bootstrap
         page.enter(panel.undo, True)
         assert not panel.brush.strokes
         page.click(transform_point(page.page.poses["upper"], vertices[front]))
