@@ -174,11 +174,7 @@ def arkit_table(
 
 
 def rate_of(rig: Path, prim: str | None) -> float:
-    """Return the frame rate of a rig, for a jaw motion whose file does not state one.
-
-    Raises:
-        typer.BadParameter: the rig does not state a frame rate.
-    """
+    """Return the frame rate of a rig, for a jaw motion whose file states none; raises typer.BadParameter."""
     from jawusd.rig import describe
 
     if rig.suffix.lower() not in options.USD_SUFFIXES:

@@ -57,11 +57,7 @@ class AuthoredMotion:
 
 
 def read_motion(rig: JawRig, source: Path) -> AuthoredMotion:
-    """Read key frames, or a table of d or poses; keys are interpolated at every whole frame, poses encoded as d.
-
-    Raises:
-        FormatError: the file is invalid.
-    """
+    """Read key frames, interpolated at every whole frame, or a table of d or of poses, which are encoded as d."""
     with naming_file(source):
         check_input(source)
         if source.suffix.lower() == ".npz":
@@ -93,11 +89,7 @@ def _retimed(key: Key, ratio: float) -> Key:
 
 
 def read_pose_table(path: Path) -> tuple[NDArray[np.int64], Array]:
-    """Return the frame numbers (F,) and poses (F, 4, 4) of a table or of tracks.
-
-    Raises:
-        FormatError: the file is invalid.
-    """
+    """Return the frame numbers (F,) and poses (F, 4, 4) of a table or of tracks."""
     if path.suffix == ".npz":
         tracks = load_tracks(path)
         return tracks.frames, tracks.T_upper_lower
@@ -225,12 +217,7 @@ def follow_curves(rig: JawRig, motion: AuthoredMotion, knots: Knots) -> Authored
 def carried_over(
     source_rig: Path, source: Path, target: JawRig, prim: str | None = None
 ) -> tuple[AuthoredMotion, Changes]:
-    """Read a motion of one rig and retarget it to another; see `pipeline.library.retarget`.
-
-    Raises:
-        FormatError: the motion or a rig cannot be read.
-        EvaluatorError: no frame of the motion has parameters.
-    """
+    """Read a motion of one rig and retarget it to another; see `pipeline.library.retarget`, also for errors."""
     from jawusd.pipeline.library import load_any_rig, retarget
 
     rig = load_any_rig(source_rig)

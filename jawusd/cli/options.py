@@ -95,11 +95,7 @@ OptionalRigArg = Annotated[
 
 
 def load_named(rig: Path, prim: str | None, stage: Path | None = None) -> JawRig:
-    """Load a rig; `--prim` is a path in the stage if one is given, otherwise in the rig's own file.
-
-    Raises:
-        JawusdError: the file is not a rig.
-    """
+    """Load a rig; `--prim` is a path in the stage if one is given, otherwise in the rig's own file."""
     import jawusd
 
     beside = stage is not None and stage.suffix.lower() in USD_SUFFIXES and stage.resolve() != rig.resolve()
@@ -147,22 +143,14 @@ def trajectory_options(
     group: str | None,
     rigid: list[str] | None,
 ) -> TrajectoryOptions:
-    """Return the conventions of a file of poses or markers, as given by the options.
-
-    Raises:
-        typer.BadParameter: a column map or rigid body is invalid.
-    """
+    """Return the conventions of a file of poses or markers, as given by the options."""
     from jawusd.pipeline.fit import TrajectoryOptions
 
     return TrajectoryOptions(_column_map(columns), length_unit, invert, rest_frame, group, rigid_bodies(rigid))
 
 
 def rigid_bodies(given: list[str] | None) -> dict[str, str]:
-    """Return the markers, or the description, of each rigid body by name.
-
-    Raises:
-        typer.BadParameter: an option is not of the form BODY=MARKERS, or a body is given twice.
-    """
+    """Return the markers, or the description, of each rigid body by name, from texts BODY=MARKERS."""
     form = "jaw=MARKERS or head=MARKERS"
     found = named_values(given, form, "--rigid")
     for name, markers in found.items():
@@ -172,22 +160,14 @@ def rigid_bodies(given: list[str] | None) -> dict[str, str]:
 
 
 def refuse_conflicts(*conflicts: tuple[object, str | None, str]) -> None:
-    """Check options that cannot be combined: for each conflict, whether it is there, an option, and a message.
-
-    Raises:
-        typer.BadParameter: there is a conflict.
-    """
+    """Raise typer.BadParameter for a conflict of options; each is whether it is there, an option, and a message."""
     for found, option, message in conflicts:
         if found:
             raise typer.BadParameter(message, param_hint=option)
 
 
 def named_values(given: Iterable[str] | None, form: str, option: str) -> dict[str, str]:
-    """Return the values by name of texts of the form NAME=VALUE.
-
-    Raises:
-        typer.BadParameter: a text is not of this form, or a name is given twice.
-    """
+    """Return the values by name of texts of the form NAME=VALUE, each with another name."""
     found: dict[str, str] = {}
     for text in given or ():
         name, _, value = (piece.strip() for piece in text.partition("="))
@@ -222,12 +202,7 @@ def subject_given(
     landmarks: Path | None,
     allow_outside: bool,
 ) -> Subject:
-    """Return the subject that the options describe by a capture, both scans, or landmarks; a capture has its own name.
-
-    Raises:
-        typer.BadParameter: the options describe no subject, or several.
-        JawusdError: a file cannot be read.
-    """
+    """Return the subject of a capture, which has its own name, of both scans, or of landmarks."""
     from jawusd.pipeline.subject import subject_of_capture, subject_of_landmarks, subject_of_scans
     from jawusd.pipeline.workspace import open_capture
 

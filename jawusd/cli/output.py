@@ -120,11 +120,7 @@ class RunLog:
     """A log file; each line begins with the number of seconds since the file was opened."""
 
     def __init__(self, path: Path, words: list[str]) -> None:
-        """Open the file and write the command line and versions.
-
-        Raises:
-            OutputError: the file cannot be written.
-        """
+        """Open the file and write the command line and versions; raises OutputError if it cannot be written."""
         from jawusd.base.version import __version__
         from jawusd.formats.atomic import destination, is_stream, open_stream
 
@@ -173,11 +169,7 @@ class _Copied:
 
 @contextlib.contextmanager
 def logged(path: Path, words: list[str]) -> Iterator[RunLog]:
-    """Copy everything written to stdout and stderr in the context to a log file.
-
-    Raises:
-        OutputError: the file cannot be written.
-    """
+    """Copy everything written to stdout and stderr in the context to a log file; raises like `RunLog`."""
     log = RunLog(path, words)
     streams = sys.stdout, sys.stderr
     sys.stdout, sys.stderr = (_Copied(stream, log) for stream in streams)

@@ -100,9 +100,6 @@ def read_stage_motion(
         prim: path of the rig's prim in the stage, or in the rig's file if the stage comes from Blender.
         mandible, skull: paths of the prims above the meshes of mandible and skull.
         origin: whether to use d or the mandible's transform if they disagree; see `motion_of_stage`.
-
-    Raises:
-        JawusdError: the stage has no such motion.
     """
     from jawusd.rig import describe
     from jawusd.rig.rebake import motion_of_stage

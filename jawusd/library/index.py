@@ -66,11 +66,7 @@ class Library:
     reread: int  # number of new or changed rigs
 
     def find(self, name: str) -> Entry:
-        """Return the rig of a subject, given the subject's name or path.
-
-        Raises:
-            FormatError: no rig matches, or several rigs match.
-        """
+        """Return the rig of a subject, given its name or path; raises FormatError unless exactly one rig matches."""
         found = [entry for entry in self.entries if name in (entry.path, entry.actor, str(Path(entry.path).parent))]
         if not found:
             known = ", ".join(entry.actor for entry in self.entries) or "no rigs"
@@ -120,8 +116,7 @@ def scan_library(folder: str | os.PathLike[str], load: Loader) -> Library:
 def load_donors(library: Library, load: Loader) -> list[Donor]:
     """Read the rigs of all subjects whose captures include every movement, named by their paths.
 
-    Raises:
-        JawusdError: a rig has become unreadable since the scan.
+    Raises a JawusdError if a rig has become unreadable since the scan.
     """
     return [Donor(e.path, load(library.folder / e.path)) for e in library.entries if not e.not_shown]
 

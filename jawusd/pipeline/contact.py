@@ -34,11 +34,7 @@ class ContactSummary(TypedDict, total=False):
 
 
 def contact_pictures(model: JawModel, subject: Subject) -> tuple[ContactPicture, ...]:
-    """Draw the tooth contacts with the teeth closed, and halfway through protrusion and both laterotrusions.
-
-    Raises:
-        RigError: tooth contact cannot be computed from the scans.
-    """
+    """Draw tooth contacts in occlusion and halfway through each glide; raises RigError if the scans define none."""
     from jawusd.media.overlay import encode_jpeg
     from jawusd.meshes.contact import ContactMap
 
@@ -62,11 +58,7 @@ def contact_pictures(model: JawModel, subject: Subject) -> tuple[ContactPicture,
 
 
 def teeth_of(rig: JawRig, meshes: Mapping[str, Mesh]) -> Teeth:
-    """Return both arches as solids, from meshes in the skull and mandible frames.
-
-    Raises:
-        RigError: the rig has no clearances, or tooth contact cannot be computed from the meshes.
-    """
+    """Return both arches as solids, from meshes in skull and mandible frame; raises RigError if that fails."""
     if rig.contact is None or any(name not in meshes for name in TEETH.values()):
         raise RigError("has no tooth contact data.", hint="Fit it with scans of both arches in occlusion.")
     teeth = tooth_solids(meshes, rig.T_anatomical_skull, rig.T_rest)

@@ -87,11 +87,7 @@ class LiveSkin:
     """
 
     def __init__(self, rig: JawRig, options: SkinOptions, *, recorded: bool) -> None:
-        """Read the map, and the face data if they are a recording; `recorded` is whether all cameras are files.
-
-        Raises:
-            FormatError: see `load_own_skin` and `read_shot_face`.
-        """
+        """Read the map, and the face data if all cameras are files (`recorded`); raises like `read_shot_face`."""
         self._skin, self._options = load_own_skin(rig, options.skin), options
         self._filter, self._agreed = SkinFilter(), deque[tuple[SkinJaw, Array]](maxlen=_COMPARED)
         whole = recorded and Path(options.face).is_file()
@@ -100,13 +96,8 @@ class LiveSkin:
     def fuse(self, at_s: float, jaw: LiveJaw, seconds: float) -> LiveJaw:
         """Return the jaw of a frame, corrected with skin; the state is `SKIN` if an arch is hidden and skin was used.
 
-        Args:
-            at_s: time of the images on the live clock [s].
-            jaw: the jaw without skin.
-            seconds: time since the previous frame [s].
-
-        Raises:
-            FormatError, FittingError: a row of the face data is invalid, or skin and visible teeth disagree.
+        `at_s` is the time of the images on the live clock [s], `seconds` the time since the previous frame [s]. Raises
+        FormatError if a row of the face data is invalid, and FittingError if skin and visible teeth disagree.
         """
         columns = self.face.at(at_s)
         found, seen = self._skin(columns), jaw.state == SolveState.SOLVED
@@ -146,9 +137,7 @@ class FaceStream:
     def __init__(self, skin: Skin, options: SkinOptions) -> None:
         """Prepare to read from the file, pipe or standard input named by `options.face`.
 
-        Raises:
-            FormatError: there is no such file, or `options.rigid` is given, although a live face must already be
-                relative to the head.
+        Raises FormatError if there is none, or for `options.rigid`: a live face must already be relative to the head.
         """
         if options.rigid:
             raise FormatError(
@@ -164,11 +153,7 @@ class FaceStream:
         self._error: JawusdError | None = None
 
     def play(self, begin_s: float, silence_s: float) -> None:
-        """Read in a thread, and wait for the first row.
-
-        Raises:
-            FormatError: no row arrives within `silence_s` [s], or the row is invalid.
-        """
+        """Read in a thread; raises FormatError if no row arrives within `silence_s` [s], or if the row is invalid."""
         threading.Thread(target=self._read, daemon=True).start()
         with self._changed:
             self._changed.wait_for(lambda: self._rows or self._error, silence_s)
@@ -189,8 +174,7 @@ class FaceStream:
     def at(self, time_s: float) -> Array:
         """Return the columns (K,) at a time of the live clock [s], waiting for the row after it; NaN where unknown.
 
-        Raises:
-            FormatError: a row is invalid, or has other columns than the map.
+        Raises FormatError if a row is invalid, or has other columns than the map.
         """
         with self._changed:
             left_s = max(0.0, time_s + _LATE_S - live_source.now_s())

@@ -63,8 +63,7 @@ def in_head(
 ) -> Array:
     """Return points (F, N, 3) [mm] relative to the rigid body "head", NaN where it is occluded; see `marker_poses`.
 
-    Raises:
-        FormatError: a rigid body other than the head is given, or the head does not fit the markers.
+    Raises FormatError if another rigid body is given, or if the head does not fit the markers.
     """
     if set(rigid) != {"head"}:
         raise FormatError(f'rigid bodies given: {", ".join(rigid)}; only "head" is allowed.')

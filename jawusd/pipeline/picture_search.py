@@ -159,9 +159,7 @@ class PictureSearch(Generic[T]):
     def picked(self, picks: Bootstrap, frames: range) -> Start[T]:
         """Return a start from picks in the frames to be tracked.
 
-        Raises:
-            TrackingError: the frame is outside the range, or the picks are inconsistent or do not match the images.
-            CaptureError: an image cannot be decoded.
+        Raises TrackingError if the picks lie outside these frames, are inconsistent or do not match the images.
         """
         if picks.frame not in frames:
             raise picks_outside(picks.frame, frames)

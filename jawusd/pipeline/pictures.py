@@ -47,14 +47,9 @@ def draw_frames(
     chosen: Sequence[tuple[int, str]],
     names: Collection[str] | None = None,
 ) -> tuple[Overlay, ...]:
-    """Draw the scans over images or masks.
+    """Draw the scans over images or masks; raises like `load_cameras` and `open_backdrops`.
 
-    Args:
-        chosen: the frames, each as its row in the tracks and the reason for drawing it.
-        names: cameras to draw; None: all with a video or masks.
-
-    Raises:
-        CaptureError, CalibrationError: see `load_cameras` and `open_backdrops`.
+    `chosen` are rows of the tracks and the reason for drawing each, `names` the cameras to draw; None: all.
     """
     from jawusd.media.overlay import encode_jpeg, tracking_sheet
 
@@ -111,16 +106,8 @@ def write_plates(
 ) -> list[str]:
     """Write undistorted plates, EXR for EXR footage and JPEG otherwise, at the paths in `cameras.usda`.
 
-    Args:
-        frames: increasing frames of the reference camera, shape (F,); frames without an image get no plate.
-        folder: the rig's folder.
-
-    Returns:
-        The file pattern of every camera, relative to the folder.
-
-    Raises:
-        CaptureError, CalibrationError: see `open_footage`.
-        OutputError: the files cannot be written.
+    `frames` (F,) are increasing numbers of the reference camera; those without an image get no plate. Returns the file
+    pattern of every camera, relative to the rig's folder. Raises like `open_footage`, and OutputError.
     """
     from jawusd.media.footage import PictureSequence
     from jawusd.media.writers import PlateWriter
@@ -150,8 +137,7 @@ def write_plates(
 def replay_parts(folder: Path, model: JawModel) -> tuple[ReplayPart, ...]:
     """Return decimated meshes of a rig with the teeth closed, in the anatomical frame [mm], for the report.
 
-    Raises:
-        RigError: the rig has no geometry.
+    Raises RigError if the rig has no geometry.
     """
     from jawusd.meshes.remeshing import decimated
     from jawusd.rig.geo import read_geometry, read_gum
@@ -196,12 +182,8 @@ def write_overlay(
 
     If `path` is a folder, it gets a contact sheet and a synchronised video of whole images for each camera with
     footage; missing images are gray. If `path` is an .mp4 file, all cameras are placed side by side, cropped to the
-    teeth; cameras without footage show their masks. Existing files are overwritten.
-
-    Raises:
-        CaptureError, CalibrationError: see `open_footage`.
-        FormatError: the tracks belong to another capture.
-        OutputError: the files cannot be written.
+    teeth; cameras without footage show their masks. Existing files are overwritten. Raises like `open_footage`,
+    FormatError if the tracks belong to another capture, and OutputError.
     """
     check_same_cameras(capture, tracks)
     if path.suffix.lower() == VIDEO:
@@ -277,8 +259,7 @@ def open_wall(
 ) -> CameraWall:
     """Return a renderer of the images of all cameras side by side, each cropped to the teeth.
 
-    Raises:
-        CaptureError, CalibrationError: no camera has video or masks, or one cannot be read.
+    Raises CaptureError or CalibrationError if no camera has video or masks, or if one cannot be read.
     """
     from jawusd.media.side_by_side import CameraWall
 

@@ -28,11 +28,7 @@ GUIDE, _FAMILY = "guide.npz", "jawusd-guide"
 
 
 def save_guide(folder: Path, inputs: str, guide: Mapping[int, RegionPose]) -> None:
-    """Write poses tracked by colour, with the hash of the inputs used.
-
-    Raises:
-        OutputError: the file cannot be written.
-    """
+    """Write poses tracked by colour, with the hash of the inputs used; raises OutputError."""
     frames = sorted(guide)
     fields = ("poses", "found", "covariance")
     arrays = {name: np.stack([getattr(guide[frame], name) for frame in frames]) for name in fields}
@@ -66,13 +62,8 @@ def combine_guide(capture: Capture, tracks: Tracks, landmarks: Array) -> tuple[T
     """Combine tracks from automatic masks with the poses tracked by colour; also return findings on their agreement.
 
     Tracks from other masks are returned unchanged. Masks segmented around a wrong pose confirm that pose; colour edges
-    have independent errors, so the wrong pose shows as a disagreement.
-
-    Args:
-        landmarks: lower teeth, then condyles, mandible coordinates [mm], shape (5, 3).
-
-    Raises:
-        FormatError: the file of the poses is corrupt.
+    have independent errors, so the wrong pose shows as a disagreement. `landmarks` (5, 3) are the lower teeth, then the
+    condyles, in mandible coordinates [mm]. Raises FormatError if the file of the poses is corrupt.
     """
     folder = auto_masks_folder(capture)
     if folder is None:

@@ -111,8 +111,7 @@ class Journal:
     def __init__(self, folder: Path, inputs: str, resume: bool) -> None:
         """Open the record, empty or, to resume, with the frames already finished from inputs with the same hash.
 
-        Raises:
-            OutputError: the folder cannot be written, or the file cannot be read.
+        Raises OutputError if the folder cannot be written, or the file not be read.
         """
         self._path = folder / RECORD
         self.entries: dict[int, FrameEntry] = {}
@@ -133,11 +132,7 @@ class Journal:
             raise OutputError(f"cannot be written: {error.strerror}.", path=self._path) from error
 
     def drop(self, frames: Iterable[int]) -> None:
-        """Remove frames.
-
-        Raises:
-            OutputError: the file cannot be written.
-        """
+        """Remove frames; raises OutputError if the file cannot be written."""
         for frame in frames:
             del self.entries[frame]
         kept = [self._head, *(_line(frame, entry) for frame, entry in self.entries.items())]
@@ -228,10 +223,7 @@ def _off(values: Array, groups: NDArray[np.str_], least_spread: float) -> Array:
 def write_summary(capture: Capture, entries: Mapping[int, FrameEntry], folder: Path) -> SegmentSummary:
     """Write segment.json, and thumbnails of the worst masks if any need inspection, to the folder of the masks.
 
-    Raises:
-        CaptureError: an image or mask cannot be read.
-        FormatError: the file of learned parameters is corrupt.
-        OutputError: a file cannot be written.
+    Raises CaptureError if an image cannot be read, FormatError if learned parameters are corrupt, and OutputError.
     """
     rows = summarise(entries)
     uncertain = sorted((row for row in rows if row["confidence"] < _LOW_CONFIDENCE), key=lambda row: row["confidence"])

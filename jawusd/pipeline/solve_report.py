@@ -40,12 +40,8 @@ def report_solve(
 ) -> Path:
     """Write the report of a solve from the .npz file of its tracks; return the path of the page.
 
-    Without the capture of the shot, the report has no images and no cameras.
-
-    Raises:
-        FormatError: the tracks were not written by `solve`.
-        CaptureError, SyncError: the shot cannot be read.
-        OutputError: the page cannot be written.
+    Without the capture of the shot, the report has no images and no cameras. Raises FormatError if the tracks were not
+    written by `solve`, CaptureError or SyncError if the shot cannot be read, and OutputError.
     """
     check_page(page)
     with naming_file(tracks):
@@ -75,10 +71,7 @@ def write_solve_report(
 ) -> None:
     """Write the report of a solve; `name` is the name of a shot without a capture.
 
-    Raises:
-        FormatError: there is no capture, and the tracks contain no frame rate.
-        MissingDependencyError: matplotlib or jinja2 is not installed.
-        OutputError: the page cannot be written.
+    Raises FormatError without any frame rate, MissingDependencyError, and OutputError.
     """
     from jawusd.report.solve_page import solve_page
 

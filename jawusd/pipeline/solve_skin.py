@@ -42,8 +42,7 @@ class SkinOfShot:
     def __init__(self, rig: JawRig, options: SkinOptions, fps: float) -> None:
         """Read the map and the face data; `fps` is the frame rate of the shot [1/s].
 
-        Raises:
-            FormatError: see `load_own_skin` and `read_shot_face`.
+        Raises like `load_own_skin` and `read_shot_face`.
         """
         self._skin = load_own_skin(rig, options.skin)
         self._fps, self._face = fps, options.face
@@ -58,9 +57,7 @@ class SkinOfShot:
     def __call__(self, frames: Array, d: Array, seen: Mask, heads: Array | None = None) -> SkinJaw:
         """Return the jaw parameters estimated from skin in some frames; see `tracking.performance.skin.SkinOf`.
 
-        Raises:
-            FittingError: the offset between the clocks is unknown and cannot be estimated, no frame has a familiar
-                face, or skin and teeth disagree.
+        Raises FittingError if the clocks cannot be aligned, no face is familiar, or skin and teeth disagree.
         """
         times = frames / self._fps
         if self.offset_s is None and seen.any():
@@ -91,8 +88,7 @@ class SkinOfShot:
 def check_agreement(face: str | os.PathLike[str], found: SkinJaw, d: Array) -> None:
     """Check that d from skin agrees with d (F, 3) [mm] from visible teeth, in frames with a familiar face.
 
-    Raises:
-        FittingError: the two differ by much more than their expected error.
+    Raises FittingError if the two differ by much more than their expected error.
     """
     away = found.d - d
     variance = np.einsum("fii->fi", found.covariance) + _FIRST_PASS_MM**2
@@ -122,11 +118,7 @@ class SkinOfFootage:
         footage: ColourFootage,
         progress: Callable[[int, int], None] = lambda done, total: None,
     ) -> None:
-        """Store the cameras of the footage by name.
-
-        Raises:
-            FittingError: there is only one camera.
-        """
+        """Store the cameras of the footage by name; raises FittingError if there is only one."""
         if len(cameras) < 2:
             raise FittingError(
                 "skin in the footage needs two or more cameras that see it.",
@@ -139,9 +131,7 @@ class SkinOfFootage:
     def __call__(self, frames: Array, d: Array, seen: Mask, heads: Array) -> SkinJaw:
         """Return the jaw parameters estimated from skin in some frames; see `tracking.performance.skin.SkinOf`.
 
-        Raises:
-            CaptureError: an image cannot be decoded.
-            FittingError: too few points on the skin can be followed, or the jaw cannot be learned from them.
+        Raises CaptureError, and FittingError if too few points can be followed, or the jaw cannot be learned from them.
         """
         X = in_head(self.followed(frames.astype(int).tolist(), d, seen, heads), heads, seen)
         self.learned, self.points = jaw_of_points(self._rig, X, d, seen, SIGMA_MM), X.shape[1]
@@ -189,8 +179,7 @@ def skin_of_footage(
 ) -> SkinOfFootage:
     """Return the estimator that uses skin in the videos of a shot; raises like `open_footage`.
 
-    Raises:
-        FittingError: fewer than two cameras have videos, or focal lengths are unknown.
+    Raises FittingError if fewer than two cameras have videos, or if focal lengths are unknown.
     """
     if free_focal:
         raise FittingError(

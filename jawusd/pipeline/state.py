@@ -201,11 +201,7 @@ def changed_files(folder: Path) -> list[Finding]:
 
 
 def make_folder(path: Path) -> None:
-    """Create a folder if it does not exist.
-
-    Raises:
-        OutputError: the folder cannot be created, or OpenUSD could not open files at its path.
-    """
+    """Create a folder unless it exists; raises OutputError, also if OpenUSD could not open files at its path."""
     check_path(path, OutputError)
     try:
         path.mkdir(parents=True, exist_ok=True)
@@ -218,9 +214,7 @@ def locked(folder: Path) -> Iterator[None]:
     """Lock the output folder for one build; the system releases the lock when the process ends, even if it is killed.
 
     Temporary files of a killed build are deleted. If the file system does not support locks, a warning is issued.
-
-    Raises:
-        OutputError: the folder cannot be written, another build holds the lock, or its labels folder is a link.
+    Raises OutputError if the folder cannot be written, another build holds the lock, or its labels folder is a link.
     """
     make_folder(folder)
     try:

@@ -63,11 +63,7 @@ class Cutter:
         return cut
 
     def walk(self, footage: ColourFootage, frames: range) -> Iterator[Cut]:
-        """Yield the function returned by `cut` for each frame.
-
-        Raises:
-            CaptureError: an image cannot be decoded.
-        """
+        """Yield the function returned by `cut` for each frame; raises CaptureError."""
         return (self.cut(pictures) for _, pictures in footage.walk(frames))
 
     def _one(self, name: str, pictures: Pictures, around: Array) -> Picture | None:
@@ -105,10 +101,8 @@ class Follower:
     def start_at(self, frame: int, poses: Array) -> tuple[Array, float]:
         """Refine T_world_upper, T_world_lower (2, 4, 4) in the frame from which `run` will start; return them, and fit.
 
-        The fit is the fraction of the contour in sight that matches the colours, 0 .. 1, for the worse arch.
-
-        Raises:
-            CaptureError: an image cannot be decoded.
+        The fit is the fraction of the contour in sight that matches the colours, 0 .. 1, for the worse arch. Raises
+        CaptureError if an image cannot be decoded.
         """
         cutter = Cutter(self.cameras, self._scans, teeth_centre(self._scans, poses), self._pool)
         axes = self._subject.T_anatomical_skull[:3, :3]
@@ -129,8 +123,7 @@ class Follower:
     def run(self, frames: range, search: PictureSearch[Array], progress: Progress) -> dict[int, RegionPose]:
         """Return the poses of all frames, from the frame last passed to `start_at`; search where the teeth are lost.
 
-        Raises:
-            CaptureError: an image cannot be decoded.
+        Raises CaptureError if an image cannot be decoded.
         """
         points, up = self._subject.landmarks[:3], self._subject.T_anatomical_skull[1, :3]
 
@@ -176,12 +169,7 @@ class Follower:
 def track_videos(
     capture: Capture, offsets: dict[str, int], meshes: Mapping[str, Mesh], jobs: int, progress: Progress
 ) -> Tracks:
-    """Track both arches using the colours of the videos; see `track`.
-
-    Raises:
-        CaptureError: fewer than two cameras have a video, or one cannot be decoded.
-        TrackingError: the teeth were not found.
-    """
+    """Track both arches using the colours of the videos of two or more cameras; see `track`, also for errors."""
     cameras, footage = open_colour_footage(capture, offsets, "tracking without masks")
     frames = range(*(capture.frames or footage.range()))
     subject = subject_of_capture(capture, meshes)
@@ -251,11 +239,7 @@ class VideoShot:
         options: VideoOptions,
         progress: Progress,
     ) -> None:
-        """Open the videos of calibrated cameras, given by name.
-
-        Raises:
-            CaptureError: no camera has a video, or one cannot be decoded.
-        """
+        """Open the videos of calibrated cameras, given by name; raises like `open_videos`."""
         videos = open_videos(capture)
         self._picks, self._teeth, self._progress = capture.bootstrap, teeth, progress
         self.cameras = {name: camera for name, camera in cameras.items() if name in videos}
@@ -283,9 +267,7 @@ class VideoShot:
     def begin(self) -> Start[Pose]:
         """Return a start, from picks in at least two cameras or from a frame in which the arches are visibly apart.
 
-        Raises:
-            TrackingError: the teeth were not found.
-            CaptureError: an image cannot be decoded.
+        Raises TrackingError if the teeth are not found, and CaptureError if an image cannot be decoded.
         """
         picks = self._picks
         if picks is not None and len(self.cameras) > 1:
@@ -307,12 +289,7 @@ def solve_videos(
     options: VideoOptions,
     progress: Progress,
 ) -> Performance:
-    """Solve a shot from the videos of its calibrated cameras, given by name; see `solve`.
-
-    Raises:
-        CaptureError: no camera has a video, or one cannot be decoded.
-        TrackingError: the teeth were not found.
-    """
+    """Solve a shot from the videos of its calibrated cameras, given by name; see `solve`, also for errors."""
     with ThreadPoolExecutor(options.jobs) as pool:
         teeth = PreparedTeeth(capture, meshes, jaw, pool.map)
         shot = VideoShot(capture, cameras, offsets, teeth, jaw, options, progress)

@@ -45,14 +45,10 @@ def open_viewer(
     play: bool = True,
     first: FirstPage | None = None,
 ) -> Viewer:
-    """Serve the rig at a path to browsers; for further errors, see `viewed_actor`.
+    """Serve the rig at a path to browsers; raises like `viewed_actor` and `PageServer`, and MissingDependencyError.
 
-    Args:
-        play: whether pages play the captured take, if there is one, when they are opened.
-        first: has served the page on the address so far.
-
-    Raises:
-        MissingDependencyError, OutputError: the viewer is not installed, or cannot listen on the address.
+    With `play`, pages play the captured take, if there is one, when they are opened; `first` has served the page on the
+    address so far.
     """
     from jawusd.viewer.server import Viewer
 
@@ -68,8 +64,7 @@ def viewed_actor(path: str | os.PathLike[str] | None, prim: str | None = None) -
         prim: path of the rig's prim, if a stage has several; motions are then layers over the stage.
 
     Raises:
-        FormatError: the file is not a rig, or the rig has no geometry.
-        RigError: the file is not USD.
+        FormatError, RigError: the file is not USD or not a rig, or the rig has no geometry.
     """
     from jawusd.rig.geo import read_geometry
     from jawusd.rig.read import describe, load_rig
@@ -140,20 +135,14 @@ class ContactView:
 
     @explain_missing_packages()
     def draw(self, d: Array) -> NDArray[np.uint8]:
-        """Return an image, RGB (h, w, 3), of both arches at d (3,) [mm].
-
-        Raises:
-            RigError: tooth contact cannot be computed from the rig's meshes.
-            MissingDependencyError: a package is missing.
-        """
+        """Return an image, RGB (h, w, 3), of both arches at d (3,) [mm]; raises like `teeth`."""
         return self._map.draw(self._rig.pose(d))
 
 
 def screen_meshes(path: Path, prim: str) -> dict[str, Mesh]:
     """Return the decimated meshes of a rig, placeholders included, by the viewer's names; gum is separate.
 
-    Raises:
-        RigError: the rig has neither a mandible nor lower teeth.
+    Raises RigError if the rig has neither a mandible nor lower teeth.
     """
     from jawusd.rig.geo import read_geometry, read_gum
     from jawusd.viewer.viewed import for_view
@@ -188,9 +177,7 @@ def motion_names(folder: Path) -> tuple[str, ...]:
 def load_motion(folder: Path, rig: JawRig, fps: float, name: str, *, prim: str | None = None) -> Clip:
     """Read one of the motions listed by `motion_names`, with its poses encoded as parameters.
 
-    Raises:
-        FormatError: there is no such motion, or it cannot be read.
-        RigError: the file is not USD.
+    Raises FormatError or RigError if there is no such motion, or if it cannot be read.
     """
     from jawusd.formats.tracks import load_tracks
     from jawusd.rig.motion_read import read_poses_of_stage
@@ -212,8 +199,7 @@ def load_motion(folder: Path, rig: JawRig, fps: float, name: str, *, prim: str |
 def save_motion(actor: Path, rig: JawRig, name: str, clip: Clip, overwrite: bool, *, prim: str | None = None) -> Path:
     """Write a motion as the animation layer anim*.usda or anim*.usdc in the folder of an actor or stage.
 
-    Raises:
-        OutputError: the name is not allowed or taken, the rig ships with jawusd, or the file cannot be written.
+    Raises OutputError also if the name is not allowed or taken, or if the rig ships with jawusd.
     """
     from jawusd.rig.animation import write_animation
     from jawusd.rig.layout import EXAMPLE_RIG
@@ -242,13 +228,9 @@ _TILE_PX, _MOST_IMAGES, _QUALITY = (320, 240), 150, 50
 def write_page(
     path: str | os.PathLike[str] | None, out: Path, prim: str | None = None, *, footage: bool = False
 ) -> None:
-    """Write a page that poses the rig at a path, with the footage of its take if wanted; see `viewed_actor`.
+    """Write a page that poses the rig at a path, with the footage of its take if wanted; raises like `viewed_actor`.
 
-    Raises:
-        CaptureError: there is no footage, or it cannot be decoded.
-        OutputError: the file cannot be written.
-        RigError: the contacts of the teeth cannot be computed from the rig's meshes.
-        MissingDependencyError: a package is missing.
+    Raises CaptureError if there is no footage, RigError if contacts cannot be computed, and OutputError.
     """
     from jawusd.formats.report import ReplayPart
     from jawusd.report.pose_page import PosePage, write_pose_page

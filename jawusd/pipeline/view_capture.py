@@ -50,8 +50,7 @@ def viewed_capture(
 
     Raises:
         FormatError: the capture or the tracks cannot be read, or the tracks use cameras that the capture lacks.
-        CaptureError: there is no footage, or a file cannot be decoded.
-        SyncError: the cameras cannot be aligned in time.
+        CaptureError, SyncError: there is no footage, a file cannot be decoded, or the cameras cannot be aligned.
     """
     from jawusd.media.side_by_side import CameraWall
     from jawusd.viewer.viewed import ViewedCapture

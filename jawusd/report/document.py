@@ -29,12 +29,9 @@ _PLACES = ("mandible", "incisor", "molar_left", "molar_right", "condyle_left", "
 def write_document(
     path: str | os.PathLike[str], data: ReportData, figures: Mapping[str, Markup] | None = None
 ) -> BuildVerdict:
-    """Write the report to an HTML file; return its summary.
+    """Write the report to an HTML file and return its summary; raises OutputError.
 
     `figures` are plots by their slot on the page; default: those of `draw_figures`.
-
-    Raises:
-        OutputError: the file cannot be written.
     """
     write_text_atomic(path, document(data, figures))
     return summary(judge(data))

@@ -159,12 +159,8 @@ def legend_beside(axis: Axes) -> None:
 def draw_sync(curves: Mapping[str, LightCurve], offsets: Mapping[str, int] | None, title: str, path: Path) -> None:
     """Plot the brightness of all clips, in full and around the first and last flash, to a PNG or SVG file.
 
-    Args:
-        offsets: frame k of a camera is simultaneous with frame k + offset of the reference camera; None: plot the clips
-            only as recorded.
-
-    Raises:
-        OutputError: the file cannot be written.
+    Frame k of a camera is simultaneous with frame k + offset of the reference camera; without offsets, the clips are
+    plotted only as recorded. Raises OutputError.
     """
     kind = path.suffix.lower().lstrip(".")
     write_bytes_atomic(path, figure_bytes(sync_figure(curves, offsets, title), kind, DPI))
@@ -283,9 +279,8 @@ def _row(name: str, value: float) -> RangeRow:
 def ranges_figure(people: Sequence[tuple[str, dict[str, list[float]]]]) -> Figure:
     """Draw the ranges of motion of actors as bars, one row per actor and one column per parameter.
 
-    Args:
-        people: name of each actor, and lowest and highest value [mm] by "opening", "laterotrusion", "protrusion"; only
-            the first 400 are drawn.
+    `people` are the name of each actor, and lowest and highest value [mm] by the keys of `_PARAMETERS`; only the first
+    400 are drawn.
     """
     drawn = list(people)[:_MOST_ROWS]
     figure, axes = new_figure(9.0, _MARGINS_IN + _ROW_IN * max(len(drawn), 2), 1, 3, sharey=True)
@@ -307,10 +302,7 @@ _WORDS = ("inside", "within tolerance", "invalid")
 def save_strip(path: Path, frames: Array, verdicts: Verdicts) -> None:
     """Write an image of verdicts on frames (F,): green is inside, amber within the tolerance, red invalid.
 
-    Plots of the margin to the bound and of the distance from the model [mm] are below the strip.
-
-    Raises:
-        OutputError: the file cannot be written.
+    Plots of the margin to the bound and of the distance from the model [mm] are below the strip. Raises OutputError.
     """
     kind = np.where(verdicts.valid, np.where(verdicts.inside(), 0, 1), 2)
     figure, (strip, lines) = new_figure(9.0, 2.6, 2, 1, sharex=True, height_ratios=[1.0, 3.0])

@@ -109,11 +109,7 @@ class PosePage:
 
 
 def write_pose_page(path: str | os.PathLike[str], page: PosePage) -> None:
-    """Write the page to an HTML file; text from the rig is escaped.
-
-    Raises:
-        OutputError: the file cannot be written.
-    """
+    """Write the page to an HTML file, with text from the rig escaped; raises OutputError."""
     text = rendered("pose.html.j2", _SCRIPTS, name=page.name, data=pose_data(page), marks=(*TOUCHING, DEEP))
     write_text_atomic(path, text)
 

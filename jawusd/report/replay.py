@@ -79,8 +79,7 @@ def _poses(motion: Array) -> str:
 def packed(part: ReplayPart) -> dict[str, object]:
     """Return a mesh for scene.js, its vertices quantised to 16 bits over the bounding box.
 
-    Raises:
-        ValueError: the mesh has more vertices than 16 bits can number.
+    Raises ValueError if the mesh has more vertices than 16 bits can number.
     """
     mesh = part.mesh
     if len(mesh.vertices) > np.iinfo(np.uint16).max:

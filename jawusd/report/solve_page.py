@@ -122,11 +122,7 @@ class UnobservedRun(NamedTuple):
 
 
 def solve_page(data: SolveReportData) -> str:
-    """Return the report as HTML, with text from files escaped.
-
-    Raises:
-        FormatError: the tracks do not come from a solve.
-    """
+    """Return the report as HTML, with text from files escaped; raises FormatError if the tracks have no solve."""
     solved = data.tracks.solved
     if solved is None:
         raise FormatError("has no solved performance.", hint="Pass the .npz written by `jawusd solve`.")

@@ -66,11 +66,7 @@ def new_figure(
 
 
 def save_figure(figure: Figure, folder: Path, name: str) -> list[Path]:
-    """Write a figure as PNG and SVG, atomically, and return the files.
-
-    Raises:
-        OutputError: a file cannot be written.
-    """
+    """Write a figure as PNG and SVG, atomically, and return the files; raises OutputError."""
     files = [folder / f"{name}.png", folder / f"{name}.svg"]
     for file in files:
         write_bytes_atomic(file, figure_bytes(figure, file.suffix[1:], DPI))

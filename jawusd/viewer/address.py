@@ -30,9 +30,7 @@ class FirstPage:
     def __init__(self, host: str, port: int) -> None:
         """Start serving on a port: 0 selects any free port; instead of a port in use, the next free one is taken.
 
-        Raises:
-            ModuleNotFoundError: viser is not installed.
-            OutputError: the address does not belong to this machine, or no port is free.
+        Raises ModuleNotFoundError without viser, and OutputError for a foreign address or without a free port.
         """
         found = find_spec("viser")
         if found is None or found.origin is None:
@@ -109,8 +107,7 @@ def _listen(host: str, port: int) -> _Server:
 def check_address(host: str) -> socket.AddressFamily:
     """Return the family of an address after checking that it can be bound; viser would try ports forever.
 
-    Raises:
-        OutputError: the address cannot be bound.
+    Raises OutputError if the address cannot be bound.
     """
     try:
         family, kind, protocol, _, address = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)[0]

@@ -33,8 +33,7 @@ class Clip:
     def of(cls, name: str, frames: ArrayLike, d: ArrayLike, fps: float) -> Clip:
         """Build a clip from frame numbers (F,) and parameters (F, 3) [mm]; interpolate lost frames (NaN).
 
-        Raises:
-            FormatError: no frame has parameters, or the frames do not increase.
+        Raises FormatError if no frame has parameters, or if the frames do not increase.
         """
         frames, d = np.asarray(frames, dtype=np.float64), np.asarray(d, dtype=np.float64)
         known = np.all(np.isfinite(d), axis=1)
@@ -62,11 +61,7 @@ def with_key(keys: KeyTrack, frame: float, d: tuple[float, float, float]) -> Key
 
 
 def without_key(keys: KeyTrack, frame: float) -> KeyTrack:
-    """Return the keys without the key at a frame.
-
-    Raises:
-        FormatError: there is no key at that frame.
-    """
+    """Return the keys without the key at a frame; raises FormatError if there is none."""
     kept = tuple(key for key in keys if key.frame != frame)
     if len(kept) == len(keys):
         known = ", ".join(f"{key.frame:g}" for key in keys) or "none"
@@ -75,11 +70,7 @@ def without_key(keys: KeyTrack, frame: float) -> KeyTrack:
 
 
 def at_frames(keys: KeyTrack, frames: Sequence[float]) -> KeyTrack:
-    """Return the keys moved to other frames, in the same order.
-
-    Raises:
-        FormatError: the numbers of frames and keys differ, or two keys would have the same frame.
-    """
+    """Return the keys at other frames, in the same order; raises FormatError unless each key has its own frame."""
     if len(frames) != len(keys) or len(set(frames)) != len(keys):
         raise FormatError(f"{len(keys)} keys at {len(set(frames))} different frames; every key needs its own frame.")
     return tuple(

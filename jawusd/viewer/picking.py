@@ -72,8 +72,7 @@ class PickBook:
     def see(self, camera: str, frame: int, pixel: tuple[float, float]) -> None:
         """Set the selected pick's pixel (x, y) in a camera, and select the next pick without a pixel in that camera.
 
-        Raises:
-            ValueError: no pick is selected, or the other picks belong to another frame.
+        Raises ValueError if no pick is selected, or if the other picks belong to another frame.
         """
         if self.selected is None:
             raise ValueError("no pick is selected: click a vertex of a scan first, or select a pick in the list")
@@ -124,11 +123,7 @@ class PickBook:
         return ""
 
     def bootstrap(self) -> Bootstrap:
-        """Return the picks in the form of the capture file.
-
-        Raises:
-            ValueError: the picks are incomplete; see `missing`.
-        """
+        """Return the picks in the form of the capture file; raises ValueError if they are incomplete."""
         lacking = self.missing()
         if lacking or self.frame is None:
             raise ValueError(f"the picks are incomplete: {lacking}")

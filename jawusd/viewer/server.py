@@ -84,10 +84,8 @@ class PageServer(ABC):
     def __init__(self, name: str, host: str, port: int, first: FirstPage | None = None) -> None:
         """Start serving on a port, or on that of `first`, which has served the page so far.
 
-        Port 0 selects any free port; instead of a port in use, the next free one is taken.
-
-        Raises:
-            OutputError: the address does not belong to this machine.
+        Port 0 selects any free port; instead of a port in use, the next free one is taken. Raises OutputError if the
+        address does not belong to this machine.
         """
         self._host = host
         self.pages: dict[int, _Closable] = {}

@@ -94,10 +94,8 @@ class Session:
     def set_parameter(self, index: int, value: float) -> None:
         """Set d1, d2 or d3 (index 0 .. 2) [mm] from a slider; successive moves of one slider are a single undo step.
 
-        With `keep_valid`, a change of the opening scales d2 and d3 down; changes of d2 and d3 stop at the bound.
-
-        Raises:
-            ValueError: the value is not finite.
+        With `keep_valid`, a change of the opening scales d2 and d3 down; changes of d2 and d3 stop at the bound. Raises
+        ValueError if the value is not finite.
         """
         if not np.isfinite(value):
             raise ValueError(f"d{index + 1} must be finite, got {value}")
@@ -147,19 +145,12 @@ class Session:
         self._gesture = None
 
     def drag_to(self, p_skull: ArrayLike, sight: ArrayLike | None = None) -> Array:
-        """Move the grabbed point to the pointer, by inverse kinematics that respects the pins.
+        """Move the grabbed point to the pointer at p_skull (3,) [mm], by inverse kinematics that respects the pins.
 
-        Args:
-            p_skull: Point under the pointer [mm], skull frame, shape (3,).
-            sight: Viewing direction, skull frame, shape (3,): the point moves to the line through p_skull in this
-                direction, and its depth follows the habitual path. If None, or if the view is from above or below, so
-                that its depth is the opening, the point moves to p_skull itself.
-
-        Returns:
-            The target that the grabbed point was moved towards [mm], skull frame, shape (3,).
-
-        Raises:
-            RuntimeError: nothing is grabbed.
+        With a viewing direction `sight` (3,), the point moves to the line through p_skull in this direction, and its
+        depth follows the habitual path; without it, or if the view is from above or below, so that its depth is the
+        opening, it moves to p_skull itself. Returns the target that it was moved towards, shape (3,) [mm]. Positions
+        and directions are in the skull frame. Raises RuntimeError if nothing is grabbed.
         """
         if self._handle is None:
             raise RuntimeError("`drag_to` was called before `grab`")
@@ -200,8 +191,7 @@ class Session:
     def move_keys(self, frames: Sequence[float], shown: float) -> None:
         """Move the keys to other frames and show the frame `shown`; successive moves are a single undo step.
 
-        Raises:
-            FormatError: the numbers of frames and keys differ, or two keys would have the same frame.
+        Raises like `motion.at_frames`.
         """
         self._change("move keys", replace(self.work, keys=at_frames(self.work.keys, frames)))
         clip = self.key_clip()
@@ -222,11 +212,7 @@ class Session:
         self._change(None, replace(self.work, interpolation=interpolation))
 
     def set_fps(self, fps: float) -> None:
-        """Set the frames per second.
-
-        Raises:
-            ValueError: the rate is out of range.
-        """
+        """Set the frames per second; raises ValueError if they are out of range."""
         if not 0 < fps <= 1000:
             raise ValueError(f"fps must be above 0 and at most 1000, got {fps}")
         self._change("fps", replace(self.work, fps=float(fps)))

@@ -113,11 +113,7 @@ def guarded(
 
 
 def upload_name(upload: viser.UploadedFile, suffixes: tuple[str, ...]) -> tuple[str, str]:
-    """Return the name of an uploaded file, for messages, and its suffix.
-
-    Raises:
-        FormatError: the suffix is not one of those allowed.
-    """
+    """Return the name of an uploaded file, for messages, and its suffix; raises FormatError for other suffixes."""
     name = PurePosixPath(upload.name.replace("\\", "/")).name
     shown = "".join(letter if letter.isprintable() else "?" for letter in name[-_MOST_LETTERS:])
     suffix = next((suffix for suffix in suffixes if name.lower().endswith(suffix)), None)
