@@ -99,14 +99,7 @@ def track(
     refuse_any(force, *drawn)
     with progress() as report:
         tracks = stage.track(
-            opened,
-            out,
-            solver=solver,
-            backend=backend,
-            model=model,
-            overlay=overlay,
-            jobs=jobs,
-            progress=report,
+            opened, out, solver=solver, backend=backend, model=model, overlay=overlay, jobs=jobs, progress=report
         )
     summary = stage.track_summary(tracks)
     found = {**summary, "file": str(out), "overlay": [str(path) for path in drawn]}
@@ -246,12 +239,7 @@ def build_many(
     if cluster is not None and workers is not None:
         raise typer.BadParameter("--workers are local processes and cannot be combined with --cluster.")
     build = BuildOptions(
-        model,
-        jobs=jobs,
-        resume=resume,
-        fresh=fresh,
-        allow_outside=allow_outside,
-        command=command_line(context),
+        model, jobs=jobs, resume=resume, fresh=fresh, allow_outside=allow_outside, command=command_line(context)
     )
     settings = many.ManyOptions(build, cluster, workers, retries)
     with stopped_by_signals():

@@ -21,13 +21,7 @@ from jawusd.pipeline.calibrate import calibrate_boards, sync_cameras
 from jawusd.pipeline.cameras import rescaled_cameras
 from jawusd.pipeline.check import check_capture, refuse_errors
 from jawusd.pipeline.fit import FitSummary, fit_subject, fit_summary
-from jawusd.pipeline.report import (
-    BuildFacts,
-    CheckResult,
-    missing_packages,
-    relative_capture_path,
-    write_build_report,
-)
+from jawusd.pipeline.report import BuildFacts, CheckResult, missing_packages, relative_capture_path, write_build_report
 from jawusd.pipeline.scans import all_labelled, store_labels, with_stored_labels
 from jawusd.pipeline.segment_record import delete_masks
 from jawusd.pipeline.state import (

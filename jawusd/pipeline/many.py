@@ -17,17 +17,7 @@ from pathlib import Path
 
 import dask
 from dask.system import CPU_COUNT
-from distributed import (
-    Client,
-    Future,
-    LocalCluster,
-    Security,
-    Worker,
-    WorkerPlugin,
-    as_completed,
-    get_worker,
-    wait,
-)
+from distributed import Client, Future, LocalCluster, Security, Worker, WorkerPlugin, as_completed, get_worker, wait
 from distributed.comm import connect
 from distributed.utils import silence_logging_cmgr
 

@@ -251,11 +251,7 @@ def _write_side_by_side(
 
 
 def open_wall(
-    capture: Capture,
-    offsets: Mapping[str, int],
-    tracks: Tracks,
-    scans: tuple[Mesh, Mesh],
-    tile_px: tuple[int, int],
+    capture: Capture, offsets: Mapping[str, int], tracks: Tracks, scans: tuple[Mesh, Mesh], tile_px: tuple[int, int]
 ) -> CameraWall:
     """Return a renderer of the images of all cameras side by side, each cropped to the teeth.
 

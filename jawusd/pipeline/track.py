@@ -15,16 +15,7 @@ from jawusd.evaluator import JawRig
 from jawusd.formats.capture import Capture
 from jawusd.formats.model import JawModel
 from jawusd.formats.notes import TakeNotes
-from jawusd.formats.tracks import (
-    LOST,
-    PARTIAL,
-    RECOVERED,
-    LostReason,
-    Tracks,
-    TrackStatus,
-    save_tracks,
-    used_coverage,
-)
+from jawusd.formats.tracks import LOST, PARTIAL, RECOVERED, LostReason, Tracks, TrackStatus, save_tracks, used_coverage
 from jawusd.geometry import LANDMARKS
 from jawusd.pipeline.calibrate import sync_cameras
 from jawusd.pipeline.cameras import load_cameras, rescaled_cameras

@@ -135,11 +135,7 @@ class Follower:
             return transform_points(relative_pose(*found.poses), points)
 
         take = TwoWays(
-            frames,
-            places,
-            lambda found: found.objective_px,
-            at_once=True,
-            progress=partial(progress, STAGE),
+            frames, places, lambda found: found.objective_px, at_once=True, progress=partial(progress, STAGE)
         )
         self.sampled_views.clear()
         self._wanted = set(np.linspace(frames.start, frames.stop - 1, _SAMPLED_VIEWS).astype(int).tolist())

@@ -120,11 +120,7 @@ class Workspace:
     """
 
     def __init__(
-        self,
-        folder: Path,
-        capture: Capture,
-        read_capture: Callable[[], Capture],
-        progress: Progress = no_progress,
+        self, folder: Path, capture: Capture, read_capture: Callable[[], Capture], progress: Progress = no_progress
     ) -> None:
         """Open a folder without locking it; `read_capture` is called again after each stage."""
         self._read_capture = read_capture

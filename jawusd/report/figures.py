@@ -23,18 +23,7 @@ from jawusd.formats.clips import LightCurve
 from jawusd.formats.model import JawModel
 from jawusd.formats.tracks import LOST, PARTIAL, RECOVERED, TRACKED, Tracks, used_coverage
 from jawusd.geometry import so3_log, transform_point, transform_points
-from jawusd.report.style import (
-    BLACK,
-    BLUE,
-    DPI,
-    GREEN,
-    GREY,
-    ORANGE,
-    SKY,
-    VERMILION,
-    figure_bytes,
-    new_figure,
-)
+from jawusd.report.style import BLACK, BLUE, DPI, GREEN, GREY, ORANGE, SKY, VERMILION, figure_bytes, new_figure
 from jawusd.report.verdicts import GOOD, LOOK
 
 _COLUMNS = 1200  # maximum number of points per curve; in longer takes, groups of frames are reduced to their extremes
