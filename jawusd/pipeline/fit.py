@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from typing_extensions import TypedDict
 
 from jawusd.base.arrays import Array
-from jawusd.base.errors import FormatError, explain_missing_packages, naming_file
+from jawusd.base.errors import FormatError, errors_name_file, explain_missing_packages
 from jawusd.formats.model import JawModel
 from jawusd.formats.poses import read_poses
 from jawusd.formats.tracks import Tracks, load_tracks
@@ -155,6 +155,7 @@ def read_motion(
     return load_tracks(path), None
 
 
+@errors_name_file
 def read_trajectory(
     path: str | os.PathLike[str], options: TrajectoryOptions
 ) -> tuple[NDArray[np.int64], Array, float | None]:
@@ -167,12 +168,7 @@ def read_trajectory(
         FormatError: the file is invalid, an option does not apply to it, or the rest frame is missing or has no pose.
         MissingDependencyError: the file is HDF5, and h5py is not installed.
     """
-    with naming_file(path):
-        return _trajectory(Path(path), options)
-
-
-def _trajectory(path: Path, options: TrajectoryOptions) -> tuple[NDArray[np.int64], Array, float | None]:
-    fps = None
+    path, fps = Path(path), None
     if options.rigid:
         if options.columns or options.group:
             raise FormatError("columns and groups apply to poses; this is a table of markers.")
@@ -205,6 +201,7 @@ def _pose_at(frames: NDArray[np.int64], T: Array, wanted: int) -> Array:
 
 
 @explain_missing_packages()
+@errors_name_file
 def read_hdf5(path: str | os.PathLike[str], group: str | None = None) -> Poses:
     """Read a trajectory of jaw-tracking-system: poses of the landmark frame in the model frame, numbered from 0.
 
@@ -215,14 +212,9 @@ def read_hdf5(path: str | os.PathLike[str], group: str | None = None) -> Poses:
         FormatError: the file is invalid, lacks the group, has data sets of wrong shapes, or poses that are not rigid.
         MissingDependencyError: h5py is not installed.
     """
-    with naming_file(path):
-        return _hdf5(Path(path), group)
-
-
-def _hdf5(path: Path, group: str | None) -> Poses:
     import h5py
 
-    if not path.is_file():
+    if not Path(path).is_file():
         raise FormatError("there is no such file.")
     try:
         with h5py.File(path, "r") as file:

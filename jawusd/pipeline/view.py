@@ -22,7 +22,6 @@ from jawusd.pipeline.state import recorded_verdict
 
 if TYPE_CHECKING:
     from jawusd.meshes.contact import ContactMap, Teeth
-    from jawusd.report.pose_page import PageFootage
     from jawusd.viewer.address import FirstPage
     from jawusd.viewer.motion import Clip
     from jawusd.viewer.server import Viewer
@@ -266,11 +265,11 @@ def write_page(
     write_pose_page(out, page)
 
 
-def _page_footage(folder: Path) -> PageFootage:
-    """Return the footage of a build's take, reduced in size and frame rate."""
+def _page_footage(folder: Path) -> dict[str, object]:
+    """Return the footage of a build's take for pose.js, reduced in size and frame rate."""
     from jawusd.media.overlay import encode_jpeg
     from jawusd.pipeline.view_capture import take_footage
-    from jawusd.report.pose_page import PageFootage
+    from jawusd.report.templates import base64_text
 
     taken = take_footage(folder, _TILE_PX)
     if taken is None:
@@ -281,8 +280,9 @@ def _page_footage(folder: Path) -> PageFootage:
         )
     first, last = taken.frames
     step = -(-(last - first + 1) // _MOST_IMAGES)
+    frames = range(first, last + 1, step)
     images = {
-        name: tuple(encode_jpeg(taken.picture(name, frame), _QUALITY) for frame in range(first, last + 1, step))
+        name: [base64_text(encode_jpeg(taken.picture(name, frame), _QUALITY)) for frame in frames]
         for name in taken.cameras
     }
-    return PageFootage(images, first, step)
+    return {"cameras": images, "first": first, "step": step}

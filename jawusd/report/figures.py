@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,7 +20,7 @@ from jawusd.evaluator.verdicts import Verdicts
 from jawusd.formats.atomic import write_bytes_atomic
 from jawusd.formats.clips import LightCurve
 from jawusd.formats.model import JawModel
-from jawusd.formats.tracks import LOST, PARTIAL, RECOVERED, TRACKED, Tracks, used_coverage
+from jawusd.formats.tracks import LOST, PARTIAL, RECOVERED, TRACKED, Tracks, uncovered_percent
 from jawusd.geometry import so3_log, transform_point, transform_points
 from jawusd.report.style import BLACK, BLUE, DPI, GREEN, GREY, ORANGE, SKY, VERMILION, figure_bytes, new_figure
 from jawusd.report.verdicts import GOOD, LOOK
@@ -52,7 +51,7 @@ def tracking_figure(tracks: Tracks) -> Figure:
     figure, axes = new_figure(11.0, 7.4, 4, 1, sharex=True, height_ratios=[1.15, 1, 1, 1])
     _draw_state(axes[0], tracks)
     residual = np.where(tracks.status == LOST, np.nan, tracks.residual_px)
-    coverage = 100 * _mean_of_cameras(used_coverage(tracks))
+    coverage = uncovered_percent(tracks)
     for index, (name, color, style) in enumerate((("upper teeth", ORANGE, "-"), ("lower teeth", BLUE, "--"))):
         axes[1].plot(*thinned(tracks.frames, residual[:, index], np.fmax), style, color=color, lw=1, label=name)
         axes[2].plot(*thinned(tracks.frames, coverage[:, index], np.fmax), style, color=color, lw=1, label=name)
@@ -120,12 +119,6 @@ def runs(frames: NDArray[np.int64], has: Mask) -> list[tuple[float, float]]:
     edges = np.flatnonzero(np.diff(np.concatenate([[False], has, [False]]).astype(np.int8)))
     spans = zip(edges[::2], edges[1::2], strict=True)
     return [(float(frames[a]) - 0.5, float(frames[b - 1] - frames[a]) + 1.0) for a, b in spans]
-
-
-def _mean_of_cameras(values: Array) -> Array:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # the mean is undefined in frames without any mask
-        return np.nanmean(values, axis=2)
 
 
 def thinned(frames: NDArray[np.int64], values: Array, keep: np.ufunc | None = None) -> tuple[Array, Array]:

@@ -84,15 +84,6 @@ _MOST_CAPTURED = 1000
 
 
 @dataclass(frozen=True, eq=False)
-class PageFootage:
-    """The footage of the take."""
-
-    cameras: Mapping[str, tuple[bytes, ...]]  # JPEG images by camera
-    first: int  # frame of the first image
-    step: int  # number of frames for which each image is shown
-
-
-@dataclass(frozen=True, eq=False)
 class PosePage:
     """Contents of the page that poses a rig."""
 
@@ -105,7 +96,8 @@ class PosePage:
     fps: float  # frame rate of the take, and of keys
     ghosts: tuple[int, float]  # number of captured poses that are shown near a pose, and their least distance in d [mm]
     teeth: Teeth | None = None  # both arches, whose contacts are painted; None without contacts
-    footage: PageFootage | None = None
+    #: JPEG images as base64 text by camera, the frame of the first one, and the step to the next
+    footage: Mapping[str, object] | None = None
 
 
 def write_pose_page(path: str | os.PathLike[str], page: PosePage) -> None:
@@ -137,11 +129,6 @@ def pose_data(page: PosePage) -> dict[str, object]:
         "traced": landmarks[list(TRACED)].round(3).tolist(),
         "ghosts": {"captured": encoded(captured.astype("<f4")), "count": page.ghosts[0], "apart": page.ghosts[1]},
         "contact": None if clearance is None or page.teeth is None else contact_data(clearance, page.teeth),
-        "footage": None if page.footage is None else _footage_data(page.footage),
+        "footage": page.footage,
         **framed(page.parts),
     }
-
-
-def _footage_data(footage: PageFootage) -> dict[str, object]:
-    texts = {name: list(map(base64_text, images)) for name, images in footage.cameras.items()}
-    return {"cameras": texts, "first": footage.first, "step": footage.step}
