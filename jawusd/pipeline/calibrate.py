@@ -85,8 +85,7 @@ def known_sync(capture: Capture) -> SyncNotes | None:
 def sync_cameras(capture: Capture, progress: Progress) -> SyncNotes:
     """Return the frame offset of every camera relative to the reference camera.
 
-    Raises:
-        SyncError: no flash was found, or the flashes of two cameras do not match.
+    Raises SyncError if no flash was found, or if the flashes of two cameras do not match.
     """
     progress("sync", 0, 1)
     if (result := known_sync(capture)) is None:
@@ -100,11 +99,7 @@ def sync_cameras(capture: Capture, progress: Progress) -> SyncNotes:
 
 @explain_missing_packages()
 def sync_videos(videos: Mapping[str, Path | ClipSource], reference: str, progress: Progress) -> SyncNotes:
-    """Return the frame offset of every camera's clip relative to the reference; see `capture.sync.align_videos`.
-
-    Raises:
-        SyncError, CaptureError: see `capture.sync.align_videos`.
-    """
+    """Return the frame offset of every clip relative to the reference; raises like `capture.sync.align_videos`."""
     from jawusd.capture.sync import align_videos
 
     progress("sync", 0, 1)
@@ -139,11 +134,7 @@ def light_curves(videos: Mapping[str, Path | ClipSource], progress: Progress) ->
 
 
 def write_light_curves(path: Path, curves: Mapping[str, LightCurve]) -> None:
-    """Write the mean brightness of every image as CSV: camera, image, time_s, brightness.
-
-    Raises:
-        OutputError: the file cannot be written.
-    """
+    """Write the mean brightness of every image as CSV (camera, image, time_s, brightness); raises OutputError."""
     lines = ["camera,picture,time_s,brightness"]
     for name, curve in curves.items():
         pictures = enumerate(zip(curve.times_s, curve.brightness))
@@ -155,9 +146,7 @@ def write_light_curves(path: Path, curves: Mapping[str, LightCurve]) -> None:
 def write_sync_plot(path: Path, curves: Mapping[str, LightCurve], result: SyncNotes | None) -> None:
     """Draw the brightness of all clips before and, if they could be aligned, after alignment, as .png or .svg.
 
-    Raises:
-        OutputError: the file cannot be written.
-        MissingDependencyError: matplotlib is not installed.
+    Raises OutputError, and MissingDependencyError without matplotlib.
     """
     from jawusd.report.figures import draw_sync
 

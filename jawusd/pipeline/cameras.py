@@ -177,8 +177,7 @@ def _at_recorded_size(camera: Camera, capture: Capture, source: CameraSource) ->
 def open_videos(capture: Capture) -> dict[str, Clip]:
     """Return the videos of a capture by the names of their cameras.
 
-    Raises:
-        CaptureError: no camera has a video, or one cannot be decoded.
+    Raises CaptureError if no camera has a video, or if one cannot be decoded.
     """
     from jawusd.media.footage import open_clip
 
@@ -191,9 +190,7 @@ def open_videos(capture: Capture) -> dict[str, Clip]:
 def open_footage(capture: Capture, tracks: Tracks | None = None) -> tuple[dict[str, Camera], dict[str, Clip]]:
     """Return the calibrated cameras, corrected as in tracks if these are given, and the videos, by camera name.
 
-    Raises:
-        CaptureError: no camera has a video, or one cannot be decoded.
-        CalibrationError: the aspect ratio of a video differs from that of its camera's calibration.
+    Raises like `load_cameras` and `open_videos`.
     """
     cameras = load_cameras(capture)
     placed = cameras if tracks is None else tracked_cameras(cameras, tracks)
@@ -205,12 +202,8 @@ def open_colour_footage(
 ) -> tuple[dict[str, Camera], ColourFootage]:
     """Return the calibrated cameras of a capture that have a video, by name, and their images.
 
-    Args:
-        offsets: frame offset by camera.
-        work: name of a task that needs at least two cameras.
-
-    Raises:
-        CaptureError, CalibrationError: see `open_footage`; or fewer than two cameras have a video.
+    Frame k of a camera is simultaneous with frame k + offset of the reference camera. Raises like `open_footage`, and
+    CaptureError if the task named `work` has fewer than two cameras with a video.
     """
     from jawusd.segmentation.picture import ColourFootage
 
@@ -225,8 +218,7 @@ def open_colour_footage(
 def open_backdrops(capture: Capture, offsets: Mapping[str, int]) -> dict[str, Backdrop]:
     """Return, by camera, the images over which scans are drawn: footage or, without footage, masks.
 
-    Raises:
-        CaptureError: no camera has video or masks, or one cannot be decoded.
+    Raises CaptureError if no camera has either, or if one cannot be decoded.
     """
     from jawusd.media.overlay import Backdrop
 

@@ -147,8 +147,7 @@ def personal_rig(landmarks: Path, library: Library, *, closest: bool, name: str,
 def fit_personal(subject: Subject, motion: PersonalMotion, progress: Progress) -> JawModel:
     """Fit the anchored model to motion transferred to a subject, and store the expected error in the model's header.
 
-    Raises:
-        FittingError: see `fitting.fit_model`.
+    Raises like `fitting.fit_model`.
     """
     from jawusd.fitting import FittingConfig, fit_model
 

@@ -246,8 +246,7 @@ def local_cluster(workers: int, retries: int) -> Iterator[Client]:
 def existing_cluster(address: str) -> Iterator[Client]:
     """Connect to a scheduler at an address such as "tcp://host:8786", and yield the client.
 
-    Raises:
-        ClusterError: no scheduler answers, or it has no workers.
+    Raises ClusterError if no scheduler answers, or if it has no workers.
     """
     try:
         asyncio.run(_greet(address))

@@ -259,11 +259,7 @@ def attempt(what: str, left_out: list[str], work: Callable[[], T]) -> T | None:
 
 
 def recorded_offsets(state: BuildState) -> dict[str, int]:
-    """Return the recorded frame offset of every camera; empty if the build did not synchronise them.
-
-    Raises:
-        FormatError: build.json is corrupt.
-    """
+    """Return the recorded frame offset of every camera, if any; raises FormatError if build.json is corrupt."""
     found = state.result("sync", SyncNotes)
     return found["offsets"] if found else {}
 
@@ -313,11 +309,7 @@ def run_paper_experiments(
 
 @explain_missing_packages()
 def draw_experiments(found: Experiments, folder: Path) -> list[Path]:
-    """Write the figures and the table of the experiments to a folder; return the files written.
-
-    Raises:
-        OutputError: a file cannot be written.
-    """
+    """Write figures and table of the experiments to a folder; return the files; raises OutputError."""
     from jawusd.paper import figures
 
     files = figures.draw_experiments(found, folder)

@@ -120,11 +120,7 @@ def with_stored_labels(capture: Capture, folder: Path) -> Capture:
 
 
 def save_reviewed(scans: Scans, meshes: Mapping[str, Mesh], arch: str, labels: NDArray[np.uint8]) -> Path:
-    """Write the reviewed labels (V,) of one of the scans (by arch) to its label file; return the file.
-
-    Raises:
-        OutputError: the file cannot be written.
-    """
+    """Write the reviewed labels (V,) of one of the scans (by arch) to its label file; return it; raises OutputError."""
     path = labels_path(getattr(scans, TEETH[arch]), scans.labels)
     save_scan_labels(path, ScanLabels(labels, "reviewed"), meshes[arch])
     return path

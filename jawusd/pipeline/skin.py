@@ -115,11 +115,7 @@ def _of_tracks(rig: JawRig, tracks: Tracks) -> JawTake:
 
 
 def load_own_skin(rig: JawRig, path: str | os.PathLike[str]) -> Skin:
-    """Read a map from skin to d that was learned with a rig.
-
-    Raises:
-        FormatError: the file is invalid, or the map belongs to another subject.
-    """
+    """Read a map from skin to d; raises FormatError if it is invalid or was not learned with this rig."""
     skin = load_skin(path)
     if skin.actor != rig.actor:
         raise FormatError(
@@ -203,8 +199,7 @@ def read_face(
 def read_shot_face(skin: Skin, options: SkinOptions) -> tuple[Array, Array]:
     """Return the times (F,) [s] of the face data of a shot, and the columns (F, K) from which a map was learned.
 
-    Raises:
-        FormatError: the file is invalid, or lacks a frame rate or columns of the map.
+    Raises FormatError if the file is invalid, or lacks a frame rate or columns of the map.
     """
     face = read_face(options.face, options.fps, options.unit, options.rigid, options.rest_frame)
     columns = own_columns(skin, options.skin, face, options.face)

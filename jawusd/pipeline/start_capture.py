@@ -72,11 +72,7 @@ def start_capture(folder: Path, square_mm: float | None, fps: float | None, prog
 
 
 def write_start(start: CaptureStart) -> None:
-    """Write capture.toml.
-
-    Raises:
-        OutputError: the file cannot be written.
-    """
+    """Write capture.toml; raises OutputError."""
     write_text_atomic(start.path, capture_text(start.sketch))
 
 

@@ -153,11 +153,7 @@ def read_files(files: Mapping[str, Path]) -> dict[str, Mesh]:
 
 
 def labelled_teeth(capture: Capture, folder: Path | None, *, ignore_files: bool = False) -> list[LabelledScan]:
-    """Return the upper and the lower scan with labels; see `label_teeth` and, for errors, `load_meshes`.
-
-    Raises:
-        CaptureError, FormatError: see `load_meshes`.
-    """
+    """Return the upper and the lower scan with labels; see `label_teeth`; raises like `load_meshes`."""
     files = {name: getattr(capture.scans, name) for name in TEETH.values()}
     return list(label_teeth(read_files(files), files, folder, ignore_files=ignore_files).values())
 
@@ -270,8 +266,7 @@ def _measured(
 def subject_of_landmarks(path: str | os.PathLike[str], name: str) -> Subject:
     """Return the subject described by a landmarks file (jawusd-landmarks/1); errors are measured at landmarks.
 
-    Raises:
-        FormatError: see `formats.landmarks.load_landmarks`.
+    Raises like `formats.landmarks.load_landmarks`.
     """
     given = load_landmarks(path)
     if given.T_anatomical_skull is not None:
@@ -284,9 +279,7 @@ def subject_of_landmarks(path: str | os.PathLike[str], name: str) -> Subject:
 def subject_of_build(folder: Path) -> Subject:
     """Return the subject of a finished build, from its model and the meshes of its rig.
 
-    Raises:
-        FormatError: the model is missing.
-        RigError: the geometry is missing.
+    Raises FormatError or RigError if one of them is missing.
     """
     from jawusd.rig.geo import read_geometry
 

@@ -41,8 +41,7 @@ def open_capture(capture: Capture | str | os.PathLike[str], *, allow_outside: bo
 def input_files(capture: Capture, names: Iterable[str]) -> dict[str, list[Path]]:
     """Return the input files of each part of a capture, for hashing.
 
-    Args:
-        names: any of "teeth", "mandible", "skull", "boards", "calibration", "masks", "videos".
+    `names` are any of "teeth", "mandible", "skull", "boards", "calibration", "masks", "videos".
     """
     parts: dict[str, list[Path]] = {}
     for name in names:
@@ -71,8 +70,7 @@ def input_hashes(
 ) -> dict[str, str]:
     """Return the content hash of each part of a capture; `hashed` returns one hash of a list of files.
 
-    Raises:
-        CaptureError: a file cannot be read.
+    Raises CaptureError if a file cannot be read.
     """
     try:
         names = list(names)
@@ -217,8 +215,7 @@ def opened(
 ) -> Iterator[Workspace]:
     """Open and lock the folder of a build; `read_capture` is called first, and again after each stage.
 
-    Raises:
-        OutputError: see `check_folder` and `state.locked`.
+    Raises like `check_folder` and `state.locked`.
     """
     capture = read_capture()
     check_folder(folder, resume=resume, fresh=fresh)
@@ -232,9 +229,8 @@ def opened(
 def check_folder(folder: Path, *, resume: bool, fresh: bool) -> None:
     """Check that a build may write to a folder.
 
-    Raises:
-        OutputError: the path is a file, or the folder is not empty, or it contains a build and neither `resume` nor
-            `fresh` is set.
+    Raises OutputError if the path is a file, or if the folder is not empty and holds no build to `resume` or replace
+    (`fresh`).
     """
     if folder.is_file():
         raise OutputError("is a file; the rig needs a folder.", path=folder, hint="Choose a new folder.")
