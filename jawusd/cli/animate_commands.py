@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-import typer
+from typer import Argument, BadParameter, Option
 
 import jawusd
 from jawusd.base.errors import FormatError
@@ -30,14 +30,14 @@ from jawusd.formats.poses import save_joint_table
 
 Rate = Annotated[
     float | None,
-    typer.Option(
+    Option(
         min=0.001,
         help="Frames per second; with --arkit, of the output. Default: from the keys or time codes, else from the rig.",
     ),
 ]
 RetargetFrom = Annotated[
     Path | None,
-    typer.Option(
+    Option(
         help="Rig for which the source was made; the source may then also be an animation layer.",
         callback=options.rig_of_folder,
     ),
@@ -82,27 +82,25 @@ def _write(
 
 def animate(
     rig: options.RigArg,
-    source: Annotated[
-        Path | None, typer.Argument(help="keys.json, a CSV of d or of poses, a stage, .fbx or .glb.")
-    ] = None,
+    source: Annotated[Path | None, Argument(help="keys.json, a CSV of d or of poses, a stage, .fbx or .glb.")] = None,
     retarget_from: RetargetFrom = None,
     arkit: Annotated[
-        Path | None, typer.Option(help="ARKit face capture instead of SOURCE: the CSV of Live Link Face.")
+        Path | None, Option(help="ARKit face capture instead of SOURCE: the CSV of Live Link Face.")
     ] = None,
     mapping: Annotated[
         Path | None,
-        typer.Option(
+        Option(
             help="The actor's map from ARKit weights to d, written by arkit-fit or skin-fit. "
             "Default: fractions of the ranges."
         ),
     ] = None,
-    out: Annotated[Path, typer.Option("-o", "--out", help="Animation layer, or .glb for the web.")] = Path("anim.usdc"),
+    out: Annotated[Path, Option("-o", "--out", help="Animation layer, or .glb for the web.")] = Path("anim.usdc"),
     fps: Rate = None,
     resample: Annotated[
         float | None,
-        typer.Option("--resample", min=0.001, help="Frames per second of the layer, if different from the source."),
+        Option("--resample", min=0.001, help="Frames per second of the layer, if different from the source."),
     ] = None,
-    splines: Annotated[Path | None, typer.Option(help="Also write the keys as USD splines, to this layer.")] = None,
+    splines: Annotated[Path | None, Option(help="Also write the keys as USD splines, to this layer.")] = None,
     force: options.Force = False,
     prim: options.Prim = None,
     allow: options.Allow = None,
@@ -146,9 +144,9 @@ _CLAMPED_MM = 0.005  # minimum distance for a frame to be listed; smaller distan
 
 def arkit_table(
     rig: options.RigArg,
-    out: Annotated[Path, typer.Option("-o", "--out", help="Table to write (CSV).")] = Path("joint.csv"),
+    out: Annotated[Path, Option("-o", "--out", help="Table to write (CSV).")] = Path("joint.csv"),
     mapping: Annotated[
-        Path | None, typer.Option(help="The actor's map, written by arkit-fit. Default: fractions of the ranges.")
+        Path | None, Option(help="The actor's map, written by arkit-fit. Default: fractions of the ranges.")
     ] = None,
     force: options.Force = False,
     prim: options.Prim = None,
@@ -178,9 +176,7 @@ def rate_of(rig: Path, prim: str | None) -> float:
     from jawusd.rig import describe
 
     if rig.suffix.lower() not in options.USD_SUFFIXES:
-        raise typer.BadParameter(
-            "is needed: neither the jaw motion nor the rig states a frame rate.", param_hint="--jaw-fps"
-        )
+        raise BadParameter("is needed: neither the jaw motion nor the rig states a frame rate.", param_hint="--jaw-fps")
     return float(describe(rig, prim)["fps"])
 
 

@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
-import typer
+from typer import Argument, BadParameter, Context, Exit, Option
 
 from jawusd.base.errors import explain_missing_packages, naming_file
 from jawusd.base.guard import map_large_arrays
@@ -19,25 +19,25 @@ from jawusd.formats.atomic import refuse_existing
 
 Solver = Literal["contour", "paper"]
 Backend = Literal["cpu", "gl"]  # renderers of the paper's solver
-SolverOption = Annotated[Solver, typer.Option(help="Tracker; paper, for comparison, is slower and less accurate.")]
-BackendOption = Annotated[Backend, typer.Option(help="Renderer of --solver paper; gl needs OpenGL 4.3 (EGL).")]
+SolverOption = Annotated[Solver, Option(help="Tracker; paper, for comparison, is slower and less accurate.")]
+BackendOption = Annotated[Backend, Option(help="Renderer of --solver paper; gl needs OpenGL 4.3 (EGL).")]
 
 
 def build(
-    context: typer.Context,
+    context: Context,
     capture: options.CaptureArg,
-    out: Annotated[Path, typer.Option("-o", "--out", help="Folder of the rig.")],
-    model: Annotated[options.Method, typer.Option(help="Form of the jaw model.")] = "anchored",
+    out: Annotated[Path, Option("-o", "--out", help="Folder of the rig.")],
+    model: Annotated[options.Method, Option(help="Form of the jaw model.")] = "anchored",
     solver: SolverOption = "contour",
     backend: BackendOption = "cpu",
-    resume: Annotated[bool, typer.Option("--resume", help="Continue an earlier build in this folder.")] = False,
-    fresh: Annotated[bool, typer.Option("--fresh", help="Delete an earlier build in this folder first.")] = False,
+    resume: Annotated[bool, Option("--resume", help="Continue an earlier build in this folder.")] = False,
+    fresh: Annotated[bool, Option("--fresh", help="Delete an earlier build in this folder first.")] = False,
     dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="List the stages that would run or be reused, with estimated times.")
+        bool, Option("--dry-run", help="List the stages that would run or be reused, with estimated times.")
     ] = False,
     jobs: options.Jobs = 2,
     prim_name: options.PrimName = None,
-    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Print the results of all stages.")] = False,
+    verbose: Annotated[bool, Option("--verbose", "-v", help="Print the results of all stages.")] = False,
     allow_outside: options.Outside = False,
     as_json: options.Json = False,
 ) -> None:
@@ -69,15 +69,13 @@ def build(
 
 def track(
     capture: options.CaptureArg,
-    out: Annotated[Path, typer.Option("-o", "--out", help="File of the tracks.")] = Path("tracks.npz"),
+    out: Annotated[Path, Option("-o", "--out", help="File of the tracks.")] = Path("tracks.npz"),
     solver: SolverOption = "contour",
     backend: BackendOption = "cpu",
-    prior: Annotated[Path | None, typer.Option(help="model.npz of this subject, as a prior for a second pass.")] = None,
+    prior: Annotated[Path | None, Option(help="model.npz of this subject, as a prior for a second pass.")] = None,
     overlay: Annotated[
         Path | None,
-        typer.Option(
-            help="Folder for videos of the tracked scans over the footage, or an .mp4 of all cameras side by side."
-        ),
+        Option(help="Folder for videos of the tracked scans over the footage, or an .mp4 of all cameras side by side."),
     ] = None,
     jobs: options.Jobs = 2,
     force: options.Force = False,
@@ -108,15 +106,13 @@ def track(
 
 def _check_backend(solver: Solver, backend: Backend) -> None:
     if backend == "gl" and solver != "paper":
-        raise typer.BadParameter("--backend gl needs --solver paper; the contour solver runs on the CPU.")
+        raise BadParameter("--backend gl needs --solver paper; the contour solver runs on the CPU.")
 
 
 def fit(
     poses: Annotated[
         Path,
-        typer.Argument(
-            help="tracks.npz, a CSV of poses, HDF5 of jaw-tracking-system, or with --rigid a table of markers."
-        ),
+        Argument(help="tracks.npz, a CSV of poses, HDF5 of jaw-tracking-system, or with --rigid a table of markers."),
     ],
     capture: options.CaptureOption = None,
     upper_teeth: options.UpperOption = None,
@@ -129,8 +125,8 @@ def fit(
     rest_frame: options.RestOption = None,
     group: options.GroupOption = None,
     rigid: options.RigidOption = None,
-    out: Annotated[Path, typer.Option("-o", "--out", help="File of the model.")] = Path("model.npz"),
-    model: Annotated[options.Method, typer.Option(help="Form of the jaw model.")] = "anchored",
+    out: Annotated[Path, Option("-o", "--out", help="File of the model.")] = Path("model.npz"),
+    model: Annotated[options.Method, Option(help="Form of the jaw model.")] = "anchored",
     force: options.Force = False,
     allow_outside: options.Outside = False,
     as_json: options.Json = False,
@@ -151,14 +147,14 @@ def fit(
 
 
 def bake(
-    model: Annotated[Path, typer.Argument(help="model.npz.")],
-    out: Annotated[Path, typer.Option("-o", "--out", help="Folder of the rig.")],
+    model: Annotated[Path, Argument(help="model.npz.")],
+    out: Annotated[Path, Option("-o", "--out", help="Folder of the rig.")],
     capture: options.CaptureOption = None,
     upper_teeth: options.UpperOption = None,
     lower_teeth: options.LowerOption = None,
     mandible: options.MandibleOption = None,
-    fps: Annotated[float, typer.Option(min=0.001, help="Frames per second, for a subject without a capture.")] = 24.0,
-    table: Annotated[int, typer.Option(help="Knots per axis of the sampled decoder: 17, 33 or 65.")] = 33,
+    fps: Annotated[float, Option(min=0.001, help="Frames per second, for a subject without a capture.")] = 24.0,
+    table: Annotated[int, Option(help="Knots per axis of the sampled decoder: 17, 33 or 65.")] = 33,
     prim_name: options.PrimName = None,
     force: options.Force = False,
     allow_outside: options.Outside = False,
@@ -179,9 +175,9 @@ def bake(
 
 
 def demo(
-    out: Annotated[Path, typer.Option("-o", "--out", help="Folder of the capture.")],
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the random subject.")] = 0,
-    frames: Annotated[int, typer.Option(min=24, max=20000, help="Number of exercise frames.")] = 240,
+    out: Annotated[Path, Option("-o", "--out", help="Folder of the capture.")],
+    seed: Annotated[int, Option(min=0, help="Seed of the random subject.")] = 0,
+    frames: Annotated[int, Option(min=24, max=20000, help="Number of exercise frames.")] = 240,
     force: options.Force = False,
 ) -> None:
     """Render a synthetic capture with ground truth: a random subject in front of three cameras.
@@ -203,30 +199,28 @@ def demo(
 
 
 def build_many(
-    context: typer.Context,
+    context: Context,
     captures: Annotated[
         Path,
-        typer.Argument(
-            metavar="LIST", help="Text file with one capture per line: PATH, or PATH, NAME of its output folder."
-        ),
+        Argument(metavar="LIST", help="Text file with one capture per line: PATH, or PATH, NAME of its output folder."),
     ],
-    out: Annotated[Path, typer.Option("-o", "--out", help="Parent folder of the rigs' folders.")],
-    model: Annotated[options.Method, typer.Option(help="Form of the jaw models.")] = "anchored",
+    out: Annotated[Path, Option("-o", "--out", help="Parent folder of the rigs' folders.")],
+    model: Annotated[options.Method, Option(help="Form of the jaw models.")] = "anchored",
     cluster: Annotated[
         str | None,
-        typer.Option(
+        Option(
             metavar="ADDRESS",
             help="Dask scheduler, such as tcp://host:8786; its workers need jawusd and the same paths. "
             "Default: local processes.",
         ),
     ] = None,
     workers: Annotated[
-        int | None, typer.Option(min=1, max=1024, help="Number of local processes. Default: one per core.")
+        int | None, Option(min=1, max=1024, help="Number of local processes. Default: one per core.")
     ] = None,
-    retries: Annotated[int, typer.Option(min=0, max=100, help="Number of retries after a local process dies.")] = 3,
-    resume: Annotated[bool, typer.Option("--resume", help="Continue earlier builds in this folder.")] = False,
-    fresh: Annotated[bool, typer.Option("--fresh", help="Delete earlier builds in this folder first.")] = False,
-    jobs: Annotated[int, typer.Option(min=1, max=64, help="Threads of each build.")] = 1,
+    retries: Annotated[int, Option(min=0, max=100, help="Number of retries after a local process dies.")] = 3,
+    resume: Annotated[bool, Option("--resume", help="Continue earlier builds in this folder.")] = False,
+    fresh: Annotated[bool, Option("--fresh", help="Delete earlier builds in this folder first.")] = False,
+    jobs: Annotated[int, Option(min=1, max=64, help="Threads of each build.")] = 1,
     allow_outside: options.Outside = False,
     as_json: options.Json = False,
 ) -> None:
@@ -237,7 +231,7 @@ def build_many(
     from jawusd.pipeline.build import BuildOptions
 
     if cluster is not None and workers is not None:
-        raise typer.BadParameter("--workers are local processes and cannot be combined with --cluster.")
+        raise BadParameter("--workers are local processes and cannot be combined with --cluster.")
     build = BuildOptions(
         model, jobs=jobs, resume=resume, fresh=fresh, allow_outside=allow_outside, command=command_line(context)
     )
@@ -247,4 +241,4 @@ def build_many(
     data = {"folder": str(out), "builds": [asdict(outcome) for outcome in outcomes]}
     emit(data, as_json, outcome_lines(outcomes))
     if any(outcome.status == many.FAILED for outcome in outcomes):
-        raise typer.Exit(1)
+        raise Exit(1)

@@ -7,7 +7,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
 
-import typer
+from typer import Argument, BadParameter, Exit, Option
 
 from jawusd.base.errors import CaptureError, OutputError, SyncError, TrackingError
 from jawusd.cli import options
@@ -16,12 +16,10 @@ from jawusd.formats.atomic import refuse_existing, write_text_atomic
 
 
 def init(
-    folder: Annotated[Path | None, typer.Argument(help="Folder with footage, scans and board clips.")] = None,
-    square_mm: Annotated[
-        float | None, typer.Option(min=0.1, max=200.0, help="Side of the board's squares [mm].")
-    ] = None,
-    fps: Annotated[float | None, typer.Option(min=0.001, max=10000.0, help="Frames per second.")] = None,
-    reference: Annotated[bool, typer.Option("--reference", help="List every key of capture.toml and exit.")] = False,
+    folder: Annotated[Path | None, Argument(help="Folder with footage, scans and board clips.")] = None,
+    square_mm: Annotated[float | None, Option(min=0.1, max=200.0, help="Side of the board's squares [mm].")] = None,
+    fps: Annotated[float | None, Option(min=0.001, max=10000.0, help="Frames per second.")] = None,
+    reference: Annotated[bool, Option("--reference", help="List every key of capture.toml and exit.")] = False,
     force: options.Force = False,
     as_json: options.Json = False,
 ) -> None:
@@ -37,7 +35,7 @@ def init(
         emit({"keys": [asdict(entry) for entry in keys]}, as_json, reference_lines(keys, 80))
         return
     if folder is None:
-        raise typer.BadParameter("give a folder or --reference.", param_hint="FOLDER")
+        raise BadParameter("give a folder or --reference.", param_hint="FOLDER")
     from jawusd.cli.text_capture import start_lines
     from jawusd.pipeline.start_capture import start_capture, write_start
 
@@ -48,7 +46,7 @@ def init(
     found = {"file": str(start.path), "found": start.found, "notes": start.notes, "missing": start.missing}
     emit(found, as_json, start_lines(start))
     if start.missing:
-        raise typer.Exit(1)
+        raise Exit(1)
 
 
 def doctor(as_json: options.Json = False) -> None:
@@ -62,22 +60,20 @@ def doctor(as_json: options.Json = False) -> None:
     found = examine()
     emit(found, as_json, examined_lines(found))
     if found["problems"]:
-        raise typer.Exit(1)
+        raise Exit(1)
 
 
 def cameras(
     source: Annotated[
         Path,
-        typer.Argument(
+        Argument(
             help="TOML (aniposelib, Pose2Sim, Caliscope), Metashape XML, RealityScan CSV or XMP, COLMAP, "
             "transforms.json, OpenCV YAML, XML or JSON, Nuke script of 3DEqualizer, or a USD stage."
         ),
     ],
-    out: Annotated[Path, typer.Option("-o", "--out", help=".toml, .usda, or a folder for COLMAP.")],
-    unit_mm: Annotated[float, typer.Option(min=1e-6, help="Length of the source's unit [mm]: 1000 for metres.")] = 1.0,
-    size: Annotated[
-        str | None, typer.Option(help="Image size, such as 1920x1080, if the source does not state it.")
-    ] = None,
+    out: Annotated[Path, Option("-o", "--out", help=".toml, .usda, or a folder for COLMAP.")],
+    unit_mm: Annotated[float, Option(min=1e-6, help="Length of the source's unit [mm]: 1000 for metres.")] = 1.0,
+    size: Annotated[str | None, Option(help="Image size, such as 1920x1080, if the source does not state it.")] = None,
     force: options.Force = False,
     as_json: options.Json = False,
 ) -> None:
@@ -89,7 +85,7 @@ def cameras(
     if size is not None:
         words = size.lower().split("x")
         if len(words) != 2 or not all(word.isdecimal() and int(word) > 0 for word in words):
-            raise typer.BadParameter(f'"{size}" is not of the form 1920x1080.', param_hint="--size")
+            raise BadParameter(f'"{size}" is not of the form 1920x1080.', param_hint="--size")
         given = int(words[0]), int(words[1])
     refuse_existing(out, force)
     found, files = convert_cameras(source, out, unit_mm, given)
@@ -111,13 +107,13 @@ def check(capture: options.CaptureArg, allow_outside: options.Outside = False, a
     listed = {"capture": str(capture), "findings": [finding.as_json() for finding in findings]}
     emit({**listed, "errors": errors, "warnings": warnings}, as_json, check_lines(findings))
     if errors:
-        raise typer.Exit(CaptureError.exit_code)
+        raise Exit(CaptureError.exit_code)
 
 
 def calibrate(
     capture: options.CaptureArg,
-    out: Annotated[Path, typer.Option("-o", "--out", help="File of the calibration.")] = Path("calibration.toml"),
-    report_file: Annotated[Path | None, typer.Option("--report", help="Also write the report as JSON.")] = None,
+    out: Annotated[Path, Option("-o", "--out", help="File of the calibration.")] = Path("calibration.toml"),
+    report_file: Annotated[Path | None, Option("--report", help="Also write the report as JSON.")] = None,
     force: options.Force = False,
     allow_outside: options.Outside = False,
     as_json: options.Json = False,
@@ -138,11 +134,11 @@ def calibrate(
 
 
 def sync(
-    clips: Annotated[list[Path], typer.Argument(help="A capture (capture.toml or its folder), or two or more videos.")],
-    reference: Annotated[str | None, typer.Option(help="Name of the reference clip. Default: the first.")] = None,
-    curves: Annotated[Path | None, typer.Option(help="Also write the brightness of every image as CSV.")] = None,
+    clips: Annotated[list[Path], Argument(help="A capture (capture.toml or its folder), or two or more videos.")],
+    reference: Annotated[str | None, Option(help="Name of the reference clip. Default: the first.")] = None,
+    curves: Annotated[Path | None, Option(help="Also write the brightness of every image as CSV.")] = None,
     plot: Annotated[
-        Path | None, typer.Option(help="Also draw the brightness before and after alignment, as PNG or SVG.")
+        Path | None, Option(help="Also draw the brightness before and after alignment, as PNG or SVG.")
     ] = None,
     force: options.Force = False,
     allow_outside: options.Outside = False,
@@ -154,15 +150,15 @@ def sync(
     from jawusd.pipeline.workspace import open_capture
 
     if plot is not None and plot.suffix.lower() not in stage.PLOT_SUFFIXES:
-        raise typer.BadParameter(f"--plot {plot} must end in {' or '.join(stage.PLOT_SUFFIXES)}.")
+        raise BadParameter(f"--plot {plot} must end in {' or '.join(stage.PLOT_SUFFIXES)}.")
     refuse_any(force, curves, plot)
     single = len(clips) == 1
     if single and reference is not None:
-        raise typer.BadParameter("--reference applies only to clips; a capture names its reference camera in [sync].")
+        raise BadParameter("--reference applies only to clips; a capture names its reference camera in [sync].")
     capture = open_capture(clips[0], allow_outside=allow_outside) if single else None
     videos = {c.name: c.clip for c in capture.cameras if c.clip} if capture else _named(clips)
     if reference is not None and reference not in videos:
-        raise typer.BadParameter(f"--reference {reference} is not one of {', '.join(videos)}.")
+        raise BadParameter(f"--reference {reference} is not one of {', '.join(videos)}.")
     result, failure = None, None
     with progress() as report:
         try:
@@ -187,23 +183,23 @@ def _named(clips: list[Path]) -> dict[str, Path]:
     short = {clip.stem: clip for clip in clips}
     named = short if len(short) == len(clips) else {str(clip): clip for clip in clips}
     if len(named) < len(clips):
-        raise typer.BadParameter("the same clip is given twice.")
+        raise BadParameter("the same clip is given twice.")
     return named
 
 
 def segment(
     capture: options.CaptureArg,
-    out: Annotated[Path, typer.Option("-o", "--out", help="Folder of the masks.")] = Path("masks"),
+    out: Annotated[Path, Option("-o", "--out", help="Folder of the masks.")] = Path("masks"),
     keys: Annotated[
         Path | None,
-        typer.Option(
+        Option(
             help="Folder of hand-drawn frames: CAMERA/upper/000123.png, CAMERA/lower/000123.png. These are finished "
             "masks, 255 on teeth and 0 elsewhere, which also teach your style; or strokes, 255 on teeth, 0 on "
             "other things, and 128 where unknown."
         ),
     ] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Keep finished frames.")] = False,
-    force: Annotated[bool, typer.Option("--force", help="Overwrite existing masks.")] = False,
+    resume: Annotated[bool, Option("--resume", help="Keep finished frames.")] = False,
+    force: Annotated[bool, Option("--force", help="Overwrite existing masks.")] = False,
     jobs: options.Jobs = 2,
     allow_outside: options.Outside = False,
     as_json: options.Json = False,
@@ -239,7 +235,7 @@ def scans(
     capture: options.CaptureArg,
     out: Annotated[
         Path | None,
-        typer.Option(
+        Option(
             "-o",
             "--out",
             help="Folder of labels and image; enter it in [scans] labels of the capture. Default: beside the "
@@ -247,7 +243,7 @@ def scans(
         ),
     ] = None,
     force: Annotated[
-        bool, typer.Option("--force", help="Label again and overwrite existing labels, including reviewed ones.")
+        bool, Option("--force", help="Label again and overwrite existing labels, including reviewed ones.")
     ] = False,
     allow_outside: options.Outside = False,
     as_json: options.Json = False,
@@ -263,7 +259,7 @@ def scans(
 
 def plates(
     capture: options.CaptureArg,
-    rig: Annotated[Path, typer.Argument(help="Folder of the rig built from the capture.")],
+    rig: Annotated[Path, Argument(help="Folder of the rig built from the capture.")],
     force: options.Force = False,
     allow_outside: options.Outside = False,
     as_json: options.Json = False,
@@ -288,13 +284,13 @@ def plates(
 def photos(
     outlines: Annotated[
         list[Path],
-        typer.Argument(help="An image per photograph: tooth outlines as bright lines on black, or filled teeth."),
+        Argument(help="An image per photograph: tooth outlines as bright lines on black, or filled teeth."),
     ],
-    upper_teeth: Annotated[Path, typer.Option(help="Scan of the upper teeth, in any frame.")],
-    lower_teeth: Annotated[Path, typer.Option(help="Scan of the lower teeth, in any frame.")],
-    out: Annotated[
-        Path, typer.Option("-o", "--out", help="Folder for photos.json and an overlay per photograph.")
-    ] = Path("photos"),
+    upper_teeth: Annotated[Path, Option(help="Scan of the upper teeth, in any frame.")],
+    lower_teeth: Annotated[Path, Option(help="Scan of the lower teeth, in any frame.")],
+    out: Annotated[Path, Option("-o", "--out", help="Folder for photos.json and an overlay per photograph.")] = Path(
+        "photos"
+    ),
     force: options.Force = False,
     as_json: options.Json = False,
 ) -> None:
@@ -310,4 +306,4 @@ def photos(
         found = align_photograph_files(outlines, upper_teeth, lower_teeth, out, force=force, progress=report)
     emit({**found.result.as_json(), "file": str(found.file)}, as_json, photograph_lines(found))
     if any(finding.severity == "error" for finding in found.result.findings):
-        raise typer.Exit(TrackingError.exit_code)
+        raise Exit(TrackingError.exit_code)

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
-import typer
+from typer import Argument, BadParameter, Option
 
 import jawusd
 from jawusd.base.errors import naming_file
@@ -30,37 +30,35 @@ if TYPE_CHECKING:
 _GUESSES = {"chin": "a chin rigid with the bone", "mean": "the mean d", "carried": "the last d"}
 
 
-TakeArg = Annotated[
-    Path, typer.Argument(help="The jaw of a take: tracks.npz, the CSV of solve, or a table of d or poses.")
-]
+TakeArg = Annotated[Path, Argument(help="The jaw of a take: tracks.npz, the CSV of solve, or a table of d or poses.")]
 FaceArg = Annotated[
     Path,
-    typer.Argument(
+    Argument(
         help="Face data of the same take: C3D, TRC or another marker table, the CSV of Live Link Face, or a CSV of "
         "columns or points."
     ),
 ]
-Out = Annotated[Path, typer.Option("-o", "--out", help="Learned map to write (.npz).")]
+Out = Annotated[Path, Option("-o", "--out", help="Learned map to write (.npz).")]
 Fps = Annotated[
-    float | None, typer.Option(min=0.001, help="Frames per second of the face capture. Default: that of the file.")
+    float | None, Option(min=0.001, help="Frames per second of the face capture. Default: that of the file.")
 ]
 JawFps = Annotated[
-    float | None, typer.Option(min=0.001, help="Frames per second of the jaw. Default: that of the tracks or the rig.")
+    float | None, Option(min=0.001, help="Frames per second of the jaw. Default: that of the tracks or the rig.")
 ]
 Offset = Annotated[
     float | None,
-    typer.Option(help="Time from frame 0 of the jaw to frame 0 of the face [s]. Default: estimated from the motion."),
+    Option(help="Time from frame 0 of the jaw to frame 0 of the face [s]. Default: estimated from the motion."),
 ]
 Bites = Annotated[
     list[str] | None,
-    typer.Option(
+    Option(
         metavar="FIRST-LAST",
         help="Frames of the jaw with closed lips and the teeth in occlusion, such as 1200-1260. Repeatable.",
     ),
 ]
 Rigid = Annotated[
     list[str] | None,
-    typer.Option(
+    Option(
         metavar="head=MARKERS",
         help="Markers fixed to the head, by name, number or marker description; the points are expressed relative to "
         "them. Names and numbers need --rest-frame. Without this option, the points must already be stabilised.",
@@ -68,11 +66,11 @@ Rigid = Annotated[
 ]
 RestFrame = Annotated[
     int | None,
-    typer.Option(help="For --rigid: number of the frame of the face data that defines the marker positions."),
+    Option(help="For --rigid: number of the frame of the face data that defines the marker positions."),
 ]
 HeadError = Annotated[
     tuple[float, float],
-    typer.Option(
+    Option(
         min=0.0,
         metavar="MM DEGREES",
         help="Additional standard deviation of the head-stabilisation error in later takes, relative to this take.",
@@ -114,7 +112,7 @@ def skin_fit(
 
 def arkit_fit(
     rig: options.RigArg,
-    face: Annotated[Path, typer.Argument(help="ARKit face capture, the CSV of Live Link Face.")],
+    face: Annotated[Path, Argument(help="ARKit face capture, the CSV of Live Link Face.")],
     take: TakeArg,
     out: Out = Path("arkit.npz"),
     fps: Fps = None,
@@ -157,7 +155,7 @@ def _learn(
     for first, last in bites:
         jaw = jaw.with_bite(first, last)
     if face.fps is None:
-        raise typer.BadParameter("is needed: the face capture does not state a frame rate.", param_hint="--fps")
+        raise BadParameter("is needed: the face capture does not state a frame rate.", param_hint="--fps")
     skin, offset_s = learn_skin(loaded, jaw, face, offset, head_error, jaw_weights=weights)
     jawusd.save_skin(out, skin)
     emit({"file": str(out), "offset_s": offset_s, **skin.meta}, as_json, _skin_lines(out, skin, offset_s))
@@ -177,14 +175,14 @@ def _skin_lines(out: Path, skin: Skin, offset_s: float) -> list[str]:
 def _frames(text: str) -> tuple[int, int]:
     first, _, last = text.partition("-")
     if not (first.isdigit() and last.isdigit() and int(first) <= int(last)):
-        raise typer.BadParameter(f'"{text}" is not of the form FIRST-LAST, such as 1200-1260.', param_hint="--bite")
+        raise BadParameter(f'"{text}" is not of the form FIRST-LAST, such as 1200-1260.', param_hint="--bite")
     return int(first), int(last)
 
 
 def align(
     rig: options.RigArg,
-    correspondences: Annotated[Path, typer.Argument(help="Points of the face model and of the rig (JSON).")],
-    out: Annotated[Path, typer.Option("-o", "--out", help="Alignment to write (JSON).")] = Path("T_skull_model.json"),
+    correspondences: Annotated[Path, Argument(help="Points of the face model and of the rig (JSON).")],
+    out: Annotated[Path, Option("-o", "--out", help="Alignment to write (JSON).")] = Path("T_skull_model.json"),
     force: options.Force = False,
     prim: options.Prim = None,
     allow: options.Allow = None,
@@ -223,19 +221,17 @@ def _align_lines(out: Path, found: Alignment, scale: bool) -> list[str]:
 
 FaceOption = Annotated[
     Path | None,
-    typer.Option(
+    Option(
         help="Face track: npz of jaw poses (FLAME, SMPL-X) or CSV of matrices in the model's frame, with --align; or "
         "the CSV of Live Link Face."
     ),
 ]
-AlignOption = Annotated[Path | None, typer.Option(help="For --face: the alignment of `jawusd align`.")]
-MappingOption = Annotated[
-    Path | None, typer.Option(help="For --face of ARKit weights: a mapping of arkit-fit or skin-fit.")
-]
-CsvOption = Annotated[Path | None, typer.Option(help="For --face: table of verdicts to write.")]
+AlignOption = Annotated[Path | None, Option(help="For --face: the alignment of `jawusd align`.")]
+MappingOption = Annotated[Path | None, Option(help="For --face of ARKit weights: a mapping of arkit-fit or skin-fit.")]
+CsvOption = Annotated[Path | None, Option(help="For --face: table of verdicts to write.")]
 StripOption = Annotated[
     Path | None,
-    typer.Option(help="For --face: image to write (PNG): green is inside, amber within the tolerance, red invalid."),
+    Option(help="For --face: image to write (PNG): green is inside, amber within the tolerance, red invalid."),
 ]
 
 
@@ -252,12 +248,12 @@ def judge_face(
 
     if face.suffix.lower() == ".csv" and "timecode" in header_of(face):
         if align is not None:
-            raise typer.BadParameter("does not apply to ARKit weights.", param_hint="--align")
+            raise BadParameter("does not apply to ARKit weights.", param_hint="--align")
         motion = read_arkit_motion(rig, face, None, mapping)
         known = np.isfinite(motion.d).all(axis=1)
         T = rig.pose(motion.d[known])
         verdicts = rig.validate(T, residual_limit_mm=residual_mm, tolerance_mm=tolerance_mm)
         return JudgedFace(motion.frames[known], verdicts, np.zeros(int(known.sum())), 0.0)
     if align is None:
-        raise typer.BadParameter("is needed: write it with `jawusd align`.", param_hint="--align")
+        raise BadParameter("is needed: write it with `jawusd align`.", param_hint="--align")
     return judge_jaw_track(rig, face, load_alignment(align), residual_mm, tolerance_mm)

@@ -7,7 +7,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Literal
 
-import typer
+from typer import Argument, BadParameter, Option
 
 from jawusd.cli import options
 from jawusd.cli.motion import carried_over, emit_motion
@@ -23,25 +23,23 @@ Use = Literal["average", "closest"]
 
 def retarget(
     anim: Annotated[
-        Path | None, typer.Argument(help="Motion of --from: an animation layer, keys.json, or a CSV of d or poses.")
+        Path | None, Argument(help="Motion of --from: an animation layer, keys.json, or a CSV of d or poses.")
     ] = None,
     source: Annotated[
-        Path | None, typer.Option("--from", help="Rig for which the motion was made.", callback=options.rig_of_folder)
+        Path | None, Option("--from", help="Rig for which the motion was made.", callback=options.rig_of_folder)
     ] = None,
-    target: Annotated[Path | None, typer.Option("--to", help="Target rig.", callback=options.rig_of_folder)] = None,
+    target: Annotated[Path | None, Option("--to", help="Target rig.", callback=options.rig_of_folder)] = None,
     landmarks: Annotated[
-        Path | None, typer.Option(help="Landmarks (JSON) of a subject without a capture, instead of a motion.")
+        Path | None, Option(help="Landmarks (JSON) of a subject without a capture, instead of a motion.")
     ] = None,
     library_folder: Annotated[
-        Path | None, typer.Option("--library", help="With --landmarks: folder of rigs to learn from.")
+        Path | None, Option("--library", help="With --landmarks: folder of rigs to learn from.")
     ] = None,
-    use: Annotated[
-        Use, typer.Option(help="With --landmarks: average the library, or use the closest subject.")
-    ] = "average",
-    fps: Annotated[float | None, typer.Option(min=0.001, help="Frames per second. Default: as in the motion.")] = None,
+    use: Annotated[Use, Option(help="With --landmarks: average the library, or use the closest subject.")] = "average",
+    fps: Annotated[float | None, Option(min=0.001, help="Frames per second. Default: as in the motion.")] = None,
     out: Annotated[
         Path | None,
-        typer.Option("-o", "--out", help="Layer of the motion (retargeted.usdc) or model of the subject (model.npz)."),
+        Option("-o", "--out", help="Layer of the motion (retargeted.usdc) or model of the subject (model.npz)."),
     ] = None,
     force: options.Force = False,
     prim: options.Prim = None,
@@ -53,7 +51,7 @@ def retarget(
         _personal(landmarks, library_folder, use, out or Path("model.npz"), force, as_json)
         return
     if not (anim and source and target) or landmarks or library_folder:
-        raise typer.BadParameter("give either ANIM with --from and --to, or --landmarks with --library.")
+        raise BadParameter("give either ANIM with --from and --to, or --landmarks with --library.")
     from jawusd.pipeline.library import load_any_rig
     from jawusd.rig import write_animation
     from jawusd.rig.read import describe
@@ -62,7 +60,7 @@ def retarget(
     refuse_existing(out, force)
     for place, option in ((out, "--out"), (target, "--to")):
         if place.suffix not in (".usd", ".usda", ".usdc"):
-            raise typer.BadParameter("must be a USD layer: .usda, .usdc or .usd.", param_hint=option)
+            raise BadParameter("must be a USD layer: .usda, .usdc or .usd.", param_hint=option)
     taker = load_any_rig(target)
     motion, changes = carried_over(source, anim, taker, prim)
     rate = fps or motion.fps or describe(target)["fps"]
@@ -90,25 +88,21 @@ def _personal(landmarks: Path, folder: Path, use: Use, out: Path, force: bool, a
 
 
 def library(
-    folder: Annotated[Path, typer.Argument(help="Folder with a subfolder per subject.")],
-    search: Annotated[str | None, typer.Option(help="List only names and paths that contain this text.")] = None,
-    like: Annotated[Path | None, typer.Option(help="Sort by similarity to these landmarks (JSON).")] = None,
+    folder: Annotated[Path, Argument(help="Folder with a subfolder per subject.")],
+    search: Annotated[str | None, Option(help="List only names and paths that contain this text.")] = None,
+    like: Annotated[Path | None, Option(help="Sort by similarity to these landmarks (JSON).")] = None,
     compare: Annotated[
-        tuple[str, str] | None, typer.Option(metavar="NAME NAME", help="Compare two subjects side by side.")
+        tuple[str, str] | None, Option(metavar="NAME NAME", help="Compare two subjects side by side.")
     ] = None,
     add: Annotated[
         Path | None,
-        typer.Option(
+        Option(
             help="First copy this rig (its folder, actor.usda or model.npz) into the library.",
             callback=options.rig_of_folder,
         ),
     ] = None,
-    name: Annotated[
-        str | None, typer.Option(help="With --add: name of the subject. Default: the name in the rig.")
-    ] = None,
-    plot: Annotated[
-        Path | None, typer.Option(help="Folder for ranges.png and ranges.svg of the listed subjects.")
-    ] = None,
+    name: Annotated[str | None, Option(help="With --add: name of the subject. Default: the name in the rig.")] = None,
+    plot: Annotated[Path | None, Option(help="Folder for ranges.png and ranges.svg of the listed subjects.")] = None,
     force: options.Force = False,
     allow: options.Allow = None,
     as_json: options.Json = False,
@@ -117,9 +111,9 @@ def library(
     from jawusd.pipeline.library import add_rig, open_library, plot_ranges
 
     if compare is not None and (search, like, plot) != (None, None, None):
-        raise typer.BadParameter("--compare cannot be combined with --search, --like or --plot.")
+        raise BadParameter("--compare cannot be combined with --search, --like or --plot.")
     if name is not None and add is None:
-        raise typer.BadParameter("needs --add.", param_hint="--name")
+        raise BadParameter("needs --add.", param_hint="--name")
     if add is not None:
         add_rig(folder, add, name, force)
     opened = open_library(folder)
@@ -173,11 +167,9 @@ def _measures(entry: Entry) -> dict[str, float]:
 
 
 def publish(
-    source: Annotated[
-        Path, typer.Argument(help="Folder of a rig (with actor.usda), or a shot.", metavar="FOLDER|SHOT")
-    ],
-    out: Annotated[Path, typer.Option("-o", "--out", help="Folder to write, or the .usdz of a shot.")],
-    prefix: Annotated[str | None, typer.Option(help="Prefix of all file names. Default: the actor's name.")] = None,
+    source: Annotated[Path, Argument(help="Folder of a rig (with actor.usda), or a shot.", metavar="FOLDER|SHOT")],
+    out: Annotated[Path, Option("-o", "--out", help="Folder to write, or the .usdz of a shot.")],
+    prefix: Annotated[str | None, Option(help="Prefix of all file names. Default: the actor's name.")] = None,
     prim_name: options.PrimName = None,
     force: options.Force = False,
     allow: options.Allow = None,
@@ -189,7 +181,7 @@ def publish(
     refuse_existing(out, force)
     if not source.is_dir():
         if out.suffix.lower() != ".usdz" or prefix is not None or prim_name is not None:
-            raise typer.BadParameter(
+            raise BadParameter(
                 "a shot is packed as .usdz; give such a file, and neither --prefix nor --prim-name.", param_hint="--out"
             )
         files = [str(write_package(out, source))]

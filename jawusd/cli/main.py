@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from typer import Option
 
 from jawusd.base.errors import JawusdError, OutputError, explain_missing_packages
 from jawusd.base.guard import out_of_memory
@@ -33,11 +34,11 @@ app = typer.Typer(
 @app.callback(invoke_without_command=True)
 def _root(
     context: typer.Context,
-    version: Annotated[bool, typer.Option("--version", help="Print the version and exit.")] = False,
-    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Also print the traceback of an error.")] = False,
+    version: Annotated[bool, Option("--version", help="Print the version and exit.")] = False,
+    verbose: Annotated[bool, Option("--verbose", "-v", help="Also print the traceback of an error.")] = False,
     log: Annotated[
         Path | None,
-        typer.Option("--log", metavar="FILE", help="Also write the output, with times and versions, to a file."),
+        Option("--log", metavar="FILE", help="Also write the output, with times and versions, to a file."),
     ] = None,
 ) -> None:
     if version:

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-import typer
+from typer import Argument, BadParameter, Context, Option
 
 if TYPE_CHECKING:
     from jawusd.evaluator import JawRig
@@ -19,11 +19,11 @@ Method = Literal["anchored", "additive", "paper", "pca"]
 LengthUnit = Literal["mm", "cm", "m"]
 USD_SUFFIXES = (".usd", ".usda", ".usdc", ".usdz")
 
-Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
-Force = Annotated[bool, typer.Option("--force", help="Overwrite an existing output.")]
-Outside = Annotated[bool, typer.Option("--allow-outside", help="Allow paths that point outside the capture's folder.")]
-Jobs = Annotated[int, typer.Option(min=1, max=64, help="Number of threads.")]
-CaptureArg = Annotated[Path, typer.Argument(help="capture.toml or its folder.")]
+Json = Annotated[bool, Option("--json", help="Print the result as JSON.")]
+Force = Annotated[bool, Option("--force", help="Overwrite an existing output.")]
+Outside = Annotated[bool, Option("--allow-outside", help="Allow paths that point outside the capture's folder.")]
+Jobs = Annotated[int, Option(min=1, max=64, help="Number of threads.")]
+CaptureArg = Annotated[Path, Argument(help="capture.toml or its folder.")]
 
 
 def _allow(folders: list[Path] | None) -> list[Path] | None:
@@ -35,7 +35,7 @@ def _allow(folders: list[Path] | None) -> list[Path] | None:
 
 Allow = Annotated[
     list[Path] | None,
-    typer.Option(
+    Option(
         "--allow",
         metavar="FOLDER",
         callback=_allow,
@@ -43,7 +43,7 @@ Allow = Annotated[
         "Environment variable: JAWUSD_ALLOW.",
     ),
 ]
-Prim = Annotated[str | None, typer.Option("--prim", help="Path of the rig's prim, if a stage has several rigs.")]
+Prim = Annotated[str | None, Option("--prim", help="Path of the rig's prim, if a stage has several rigs.")]
 
 
 def _prim_name(name: str | None) -> str | None:
@@ -54,7 +54,7 @@ def _prim_name(name: str | None) -> str | None:
 
 PrimName = Annotated[
     str | None,
-    typer.Option(
+    Option(
         "--prim-name",
         callback=_prim_name,
         help="Name of the actor's prim and joints. Default: derived from the actor's name.",
@@ -72,12 +72,12 @@ def rig_of_folder(rig: Path | None) -> Path | None:
 _FOLDER = "jawusd.folder"  # key under which the path given for a rig is stored in the context
 
 
-def _noted(context: typer.Context, rig: Path | None) -> Path | None:
+def _noted(context: Context, rig: Path | None) -> Path | None:
     context.meta[_FOLDER] = rig
     return rig_of_folder(rig)
 
 
-def changed_in_folder(context: typer.Context) -> list[Finding]:
+def changed_in_folder(context: Context) -> list[Finding]:
     """Return findings on files modified since the build, if the rig was given as the folder of a build."""
     from jawusd.pipeline.state import changed_files
 
@@ -86,11 +86,11 @@ def changed_in_folder(context: typer.Context) -> list[Finding]:
 
 
 RigArg = Annotated[
-    Path, typer.Argument(help="Folder of a rig, its actor.usda or another layer, or model.npz.", callback=_noted)
+    Path, Argument(help="Folder of a rig, its actor.usda or another layer, or model.npz.", callback=_noted)
 ]
 OptionalRigArg = Annotated[
     Path | None,
-    typer.Argument(help="Folder of a rig, its actor.usda or another layer, model.npz, or tracks.npz.", callback=_noted),
+    Argument(help="Folder of a rig, its actor.usda or another layer, model.npz, or tracks.npz.", callback=_noted),
 ]
 
 
@@ -103,29 +103,25 @@ def load_named(rig: Path, prim: str | None, stage: Path | None = None) -> JawRig
 
 
 # Options that describe the subject.
-CaptureOption = Annotated[Path | None, typer.Option(help="Capture with scans and landmarks.")]
-UpperOption = Annotated[Path | None, typer.Option(help="Scan of the upper teeth, instead of a capture.")]
+CaptureOption = Annotated[Path | None, Option(help="Capture with scans and landmarks.")]
+UpperOption = Annotated[Path | None, Option(help="Scan of the upper teeth, instead of a capture.")]
 LowerOption = Annotated[
-    Path | None, typer.Option(help="Scan of the lower teeth, in the same coordinate frame, in occlusion.")
+    Path | None, Option(help="Scan of the lower teeth, in the same coordinate frame, in occlusion.")
 ]
-MandibleOption = Annotated[Path | None, typer.Option(help="Mesh of the mandible, in the same coordinate frame.")]
-LandmarksOption = Annotated[Path | None, typer.Option(help="Landmarks (JSON), instead of a capture or scans.")]
+MandibleOption = Annotated[Path | None, Option(help="Mesh of the mandible, in the same coordinate frame.")]
+LandmarksOption = Annotated[Path | None, Option(help="Landmarks (JSON), instead of a capture or scans.")]
 
 # Options for the conventions of a file of poses.
 ColumnsOption = Annotated[
-    str | None, typer.Option(help="Column names of a table: frame=Frame,tx=X,ty=Y,tz=Z,qw=W,... or m00=...,m01=...")
+    str | None, Option(help="Column names of a table: frame=Frame,tx=X,ty=Y,tz=Z,qw=W,... or m00=...,m01=...")
 ]
-UnitOption = Annotated[LengthUnit, typer.Option(help="Length unit, if the file does not state it.")]
-InvertOption = Annotated[
-    bool, typer.Option("--invert", help="Invert the poses: those of the file map skull to mandible.")
-]
-RestOption = Annotated[
-    int | None, typer.Option(help="Frame with the teeth in occlusion; poses are made relative to it.")
-]
-GroupOption = Annotated[str | None, typer.Option(help="Trajectory of an HDF5 file.")]
+UnitOption = Annotated[LengthUnit, Option(help="Length unit, if the file does not state it.")]
+InvertOption = Annotated[bool, Option("--invert", help="Invert the poses: those of the file map skull to mandible.")]
+RestOption = Annotated[int | None, Option(help="Frame with the teeth in occlusion; poses are made relative to it.")]
+GroupOption = Annotated[str | None, Option(help="Trajectory of an HDF5 file.")]
 RigidOption = Annotated[
     list[str] | None,
-    typer.Option(
+    Option(
         metavar="BODY=MARKERS",
         help="For a file of markers: those fixed to the jaw and, unless the head is still, those fixed to the head. "
         "Give numbers or names, such as jaw=5,6,7,8 or jaw=JL,JR,JF (with --rest-frame), or a marker description, "
@@ -155,7 +151,7 @@ def rigid_bodies(given: list[str] | None) -> dict[str, str]:
     found = named_values(given, form, "--rigid")
     for name, markers in found.items():
         if name not in ("head", "jaw"):
-            raise typer.BadParameter(f'"{name}={markers}" is not of the form {form}.', param_hint="--rigid")
+            raise BadParameter(f'"{name}={markers}" is not of the form {form}.', param_hint="--rigid")
     return found
 
 
@@ -163,7 +159,7 @@ def refuse_conflicts(*conflicts: tuple[object, str | None, str]) -> None:
     """Raise typer.BadParameter for a conflict of options; each is whether it is there, an option, and a message."""
     for found, option, message in conflicts:
         if found:
-            raise typer.BadParameter(message, param_hint=option)
+            raise BadParameter(message, param_hint=option)
 
 
 def named_values(given: Iterable[str] | None, form: str, option: str) -> dict[str, str]:
@@ -172,9 +168,9 @@ def named_values(given: Iterable[str] | None, form: str, option: str) -> dict[st
     for text in given or ():
         name, _, value = (piece.strip() for piece in text.partition("="))
         if not name or not value:
-            raise typer.BadParameter(f'"{text}" is not of the form {form}.', param_hint=option)
+            raise BadParameter(f'"{text}" is not of the form {form}.', param_hint=option)
         if name in found:
-            raise typer.BadParameter(f'"{name}" is given twice.', param_hint=option)
+            raise BadParameter(f'"{name}" is given twice.', param_hint=option)
         found[name] = value
     return found
 
@@ -185,7 +181,7 @@ def _column_map(text: str | None) -> dict[str, str]:
     found = named_values(text.split(",") if text else None, "name=column", "--columns")
     for name in found:
         if name not in ("frame", *QUATERNION_COLUMNS, *MATRIX_COLUMNS):
-            raise typer.BadParameter(
+            raise BadParameter(
                 f'"{name}" is not a column of poses; it must be one of frame, '
                 f"{', '.join(QUATERNION_COLUMNS)}, m00 ... m33.",
                 param_hint="--columns",
@@ -209,11 +205,11 @@ def subject_given(
     files = {"upper_teeth": upper_teeth, "lower_teeth": lower_teeth, "mandible": mandible}
     scans = {key: path for key, path in files.items() if path is not None}
     if sum((capture is not None, bool(scans), landmarks is not None)) != 1:
-        raise typer.BadParameter("give either --capture, or --upper-teeth and --lower-teeth, or --landmarks.")
+        raise BadParameter("give either --capture, or --upper-teeth and --lower-teeth, or --landmarks.")
     if capture is not None:
         return subject_of_capture(open_capture(capture, allow_outside=allow_outside))
     if landmarks is not None:
         return subject_of_landmarks(landmarks, name)
     if not {"upper_teeth", "lower_teeth"} <= set(scans):
-        raise typer.BadParameter("give both --upper-teeth and --lower-teeth; --mandible is optional.")
+        raise BadParameter("give both --upper-teeth and --lower-teeth; --mandible is optional.")
     return subject_of_scans(scans, name)

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
+from typer import Argument, BadParameter, Option
 
 from jawusd.base.errors import naming_file
 from jawusd.base.guard import map_large_arrays
@@ -24,16 +24,14 @@ if TYPE_CHECKING:
 def report(
     source: Annotated[
         Path,
-        typer.Argument(
-            help="Folder of a build, tracks.npz of a solve, or (for experiments) tracks.npz, CSV or HDF5 poses."
-        ),
+        Argument(help="Folder of a build, tracks.npz of a solve, or (for experiments) tracks.npz, CSV or HDF5 poses."),
     ],
     experiments: Annotated[
-        bool, typer.Option("--experiments", help="Run the paper's experiments (figs. 5, 12, 13) and plot the coverage.")
+        bool, Option("--experiments", help="Run the paper's experiments (figs. 5, 12, 13) and plot the coverage.")
     ] = False,
     out: Annotated[
         Path | None,
-        typer.Option(
+        Option(
             "-o",
             "--out",
             help="Folder of the figures, or page of a solve. Default: DIR/experiments, or beside the tracks.",
@@ -50,8 +48,8 @@ def report(
     rest_frame: options.RestOption = None,
     group: options.GroupOption = None,
     rigid: options.RigidOption = None,
-    starts: Annotated[int, typer.Option(min=1, max=64, help="Number of random starts of the paper's networks.")] = 2,
-    force: Annotated[bool, typer.Option("--force", help="Overwrite existing figures, or the page of a solve.")] = False,
+    starts: Annotated[int, Option(min=1, max=64, help="Number of random starts of the paper's networks.")] = 2,
+    force: Annotated[bool, Option("--force", help="Overwrite existing figures, or the page of a solve.")] = False,
     allow_outside: options.Outside = False,
     as_json: options.Json = False,
 ) -> None:
@@ -61,7 +59,7 @@ def report(
         _report_found(source, capture, out, force, allow_outside, as_json)
         return
     if out is None and not source.is_dir():
-        raise typer.BadParameter("give the folder for the figures with -o.", param_hint="--out")
+        raise BadParameter("give the folder for the figures with -o.", param_hint="--out")
     from jawusd.pipeline import report as stage
     from jawusd.pipeline.fit import read_motion
     from jawusd.pipeline.subject import subject_of_build
@@ -110,7 +108,7 @@ def _report_found(
         with progress() as tell:
             path = report_build(source, capture, tell, allow_outside=allow_outside)
     else:
-        raise typer.BadParameter(
+        raise BadParameter(
             "no report is available for a pose file; add --experiments to run the paper's experiments on it."
         )
     emit({"file": str(path), "bytes": path.stat().st_size}, as_json, [str(path)])
@@ -118,14 +116,14 @@ def _report_found(
 
 PageOption = Annotated[
     Path | None,
-    typer.Option(help="Write a web page that poses the rig without a server, and exit.", metavar="FILE.html"),
+    Option(help="Write a web page that poses the rig without a server, and exit.", metavar="FILE.html"),
 ]
 
 
 def view(
     rig: Annotated[
         Path | None,
-        typer.Argument(
+        Argument(
             help="A rig (actor.usda, another layer of it, or its folder) or a capture (capture.toml or its folder). "
             "Default: the example rig that ships with jawusd.",
             metavar="RIG|CAPTURE",
@@ -133,18 +131,18 @@ def view(
     ] = None,
     tracks: Annotated[
         Path | None,
-        typer.Option(help="Poses to draw over the footage of a capture: the folder of its build, or tracks.npz."),
+        Option(help="Poses to draw over the footage of a capture: the folder of its build, or tracks.npz."),
     ] = None,
     host: Annotated[
-        str, typer.Option(help="Address to listen on; the default accepts connections only from this machine.")
+        str, Option(help="Address to listen on; the default accepts connections only from this machine.")
     ] = ("127.0.0.1"),
-    port: Annotated[int, typer.Option(min=0, max=65535, help="Port; if it is in use, the next free port.")] = 8080,
-    browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open a browser.")] = True,
+    port: Annotated[int, Option(min=0, max=65535, help="Port; if it is in use, the next free port.")] = 8080,
+    browser: Annotated[bool, Option("--browser/--no-browser", help="Open a browser.")] = True,
     play: Annotated[
-        bool, typer.Option("--play/--no-play", help="Begin by playing the captured take of a rig, if it has one.")
+        bool, Option("--play/--no-play", help="Begin by playing the captured take of a rig, if it has one.")
     ] = True,
     page: PageOption = None,
-    footage: Annotated[bool, typer.Option("--footage", help="Also write the footage of the take into --page.")] = False,
+    footage: Annotated[bool, Option("--footage", help="Also write the footage of the take into --page.")] = False,
     force: options.Force = False,
     allow_outside: options.Outside = False,
     prim: options.Prim = None,

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
-import typer
 from numpy.typing import NDArray
+from typer import Argument, BadParameter, Context, Exit, Option
 
 import jawusd
 from jawusd.base.arrays import Array
@@ -36,13 +36,13 @@ Triple = tuple[float, float, float]
 
 
 def info(
-    context: typer.Context,
+    context: Context,
     rig: options.OptionalRigArg = None,
     schema: Annotated[
         bool,
-        typer.Option("--schema", help="Print the path of the USD schema JawRigAPI, and how other programs find it."),
+        Option("--schema", help="Print the path of the USD schema JawRigAPI, and how other programs find it."),
     ] = False,
-    frame: Annotated[int | None, typer.Option(help="For tracks.npz: describe the tracking of this frame.")] = None,
+    frame: Annotated[int | None, Option(help="For tracks.npz: describe the tracking of this frame.")] = None,
     prim: options.Prim = None,
     allow: options.Allow = None,
     as_json: options.Json = False,
@@ -58,7 +58,7 @@ def info(
         emit({"schema": "JawRigAPI", "folder": folder, "variable": VARIABLE}, as_json, lines)
         return
     if rig is None:
-        raise typer.BadParameter("give a rig file or tracks, or --schema.", param_hint="RIG")
+        raise BadParameter("give a rig file or tracks, or --schema.", param_hint="RIG")
     if rig.suffix == ".npz":
         from jawusd.pipeline.track import frame_summary, track_summary
 
@@ -71,7 +71,7 @@ def info(
             emit(one, as_json, frame_lines(one))
         return
     if frame is not None:
-        raise typer.BadParameter("--frame applies only to tracks (.npz).")
+        raise BadParameter("--frame applies only to tracks (.npz).")
     from jawusd.pipeline.state import recorded_verdict
     from jawusd.rig import describe
 
@@ -120,7 +120,7 @@ def pose(
     rig: options.RigArg,
     d: Annotated[
         Triple,
-        typer.Option("--d", metavar="D1 D2 D3", help="Opening, laterotrusion (+ left), protrusion (+ forward) [mm]."),
+        Option("--d", metavar="D1 D2 D3", help="Opening, laterotrusion (+ left), protrusion (+ forward) [mm]."),
     ],
     prim: options.Prim = None,
     allow: options.Allow = None,
@@ -150,23 +150,21 @@ def pose(
 
 def _check_finite(values: Triple, option: str) -> None:
     if not all(math.isfinite(value) for value in values):
-        raise typer.BadParameter("values must be finite", param_hint=option)
+        raise BadParameter("values must be finite", param_hint=option)
 
 
 def validate(
-    context: typer.Context,
+    context: Context,
     rig: options.RigArg,
     poses: Annotated[
-        Path | None, typer.Argument(help="CSV or JSON of poses or of d, tracks.npz, or an animated USD stage.")
+        Path | None, Argument(help="CSV or JSON of poses or of d, tracks.npz, or an animated USD stage.")
     ] = None,
     residual_mm: Annotated[
-        float | None, typer.Option(help="Maximum distance from the model [mm]. Default: the rig's limit.")
+        float | None, Option(help="Maximum distance from the model [mm]. Default: the rig's limit.")
     ] = None,
     tolerance_mm: Annotated[
         float | None,
-        typer.Option(
-            min=0.0, help="Allowed distance outside the bound [mm]; 0 for authored poses. Default: set by the rig."
-        ),
+        Option(min=0.0, help="Allowed distance outside the bound [mm]; 0 for authored poses. Default: set by the rig."),
     ] = None,
     face: face_commands.FaceOption = None,
     align: face_commands.AlignOption = None,
@@ -185,7 +183,7 @@ def validate(
     """
     if face is not None:
         if poses is not None:
-            raise typer.BadParameter("give either poses or --face.", param_hint="--face")
+            raise BadParameter("give either poses or --face.", param_hint="--face")
         refuse_any(force, csv, strip)
         judged = face_commands.judge_face(jawusd.load(rig, prim=prim), face, align, mapping, residual_mm, tolerance_mm)
         if csv is not None:
@@ -201,7 +199,7 @@ def validate(
         _emit_verdicts("frames", judged.frames, judged.verdicts, limits, {"widened_mm": widened_mm}, as_json)
         return
     if align or mapping or csv or strip:
-        raise typer.BadParameter("is needed for --align, --mapping, --csv and --strip.", param_hint="--face")
+        raise BadParameter("is needed for --align, --mapping, --csv and --strip.", param_hint="--face")
     if poses is None:
         _validate_rig(rig, options.changed_in_folder(context), as_json)
         return
@@ -240,7 +238,7 @@ def _emit_verdicts(
     summary = f"{len(rows)} {noun}: {inside} inside, {within} within tolerance, {invalid} invalid ({limits})"
     emit({noun: len(rows), **counts, **more, "verdicts": rows}, as_json, [*lines, *warnings, summary])
     if invalid or warnings:
-        raise typer.Exit(NO)
+        raise Exit(NO)
 
 
 def _unbaked(rig: JawRig, path: Path, prim: str | None) -> tuple[dict[str, object], list[str]]:
@@ -283,14 +281,14 @@ def _validate_rig(path: Path, changed: list[Changed], as_json: bool) -> None:
     lines = [f"{finding.severity}: {finding.rule}: {finding.path}: {finding.message}" for finding in findings]
     emit(result, as_json, [*lines, f"{path}: {len(errors)} errors, {len(findings) - len(errors)} other findings"])
     if errors:
-        raise typer.Exit(NO)
+        raise Exit(NO)
 
 
 def ik(
     rig: options.RigArg,
-    point: Annotated[Triple, typer.Option(metavar="X Y Z", help="Point on the mandible at rest [mm].")],
-    target: Annotated[Triple, typer.Option(metavar="X Y Z", help="Target of the point, skull frame [mm].")],
-    start: Annotated[Triple | None, typer.Option(metavar="D1 D2 D3", help="Initial parameters [mm].")] = None,
+    point: Annotated[Triple, Option(metavar="X Y Z", help="Point on the mandible at rest [mm].")],
+    target: Annotated[Triple, Option(metavar="X Y Z", help="Target of the point, skull frame [mm].")],
+    start: Annotated[Triple | None, Option(metavar="D1 D2 D3", help="Initial parameters [mm].")] = None,
     prim: options.Prim = None,
     allow: options.Allow = None,
     as_json: options.Json = False,

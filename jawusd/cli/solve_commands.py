@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-import typer
+from typer import Argument, BadParameter, Option
 
 from jawusd.cli import options
 from jawusd.cli.face_commands import Fps, RestFrame, Rigid
@@ -25,59 +25,55 @@ if TYPE_CHECKING:
 
 Head = Literal["free", "fixed"]  # motion relative to the cameras
 Focal = Literal["known", "free"]  # calibrated or estimated
-ShotArg = Annotated[Path, typer.Argument(help="capture.toml of the shot, or its folder.")]
+ShotArg = Annotated[Path, Argument(help="capture.toml of the shot, or its folder.")]
 OverlayFile = Annotated[
-    Path | None, typer.Option(help="Video (.mp4) to write: the solved teeth over the images of all cameras.")
+    Path | None, Option(help="Video (.mp4) to write: the solved teeth over the images of all cameras.")
 ]
 ReportFile = Annotated[
     Path | None,
-    typer.Option(
-        help="Page (.html) to write: curves with expected errors, frames with hidden teeth, findings, images."
-    ),
+    Option(help="Page (.html) to write: curves with expected errors, frames with hidden teeth, findings, images."),
 ]
 SkinFile = Annotated[
     Path | None,
-    typer.Option(
+    Option(
         help="For frames with hidden teeth: map from facial skin to d, written by skin-fit, with --face; or the word "
         "footage, to follow skin in the videos and learn from the frames with visible teeth."
     ),
 ]
 FaceFile = Annotated[
-    Path | None, typer.Option(help="Face data of the shot, as for skin-fit, with the points or columns of --skin.")
+    Path | None, Option(help="Face data of the shot, as for skin-fit, with the points or columns of --skin.")
 ]
 FaceOffset = Annotated[
     float | None,
-    typer.Option(
-        help="Time from frame 0 of the shot to frame 0 of the face [s]. Default: estimated from visible teeth."
-    ),
+    Option(help="Time from frame 0 of the shot to frame 0 of the face [s]. Default: estimated from visible teeth."),
 ]
 LiveFaceFile = Annotated[
     Path | None,
-    typer.Option(
+    Option(
         help="Live face data with the points or columns of --skin: - (standard input), a pipe or a growing CSV. "
         "For recorded cameras, a recording as for skin-fit."
     ),
 ]
 LiveFaceOffset = Annotated[
     float,
-    typer.Option(
+    Option(
         help="Time to add to the times of the face [s]: negative if the face arrives later than the images. For a "
         "recording, the time from the first images to frame 0 of the face."
     ),
 ]
-SkinOnly = Annotated[bool, typer.Option("--skin-only", help="Ignore the images: no frame of the shot shows the teeth.")]
+SkinOnly = Annotated[bool, Option("--skin-only", help="Ignore the images: no frame of the shot shows the teeth.")]
 
 
 def solve(
     rig: options.RigArg,
     shot: ShotArg,
     out: Annotated[
-        Path, typer.Option("-o", "--out", help="Table of d (.csv), tracks (.npz) or animation layer (.usdc).")
+        Path, Option("-o", "--out", help="Table of d (.csv), tracks (.npz) or animation layer (.usdc).")
     ] = Path("take.csv"),
     overlay: OverlayFile = None,
     report: ReportFile = None,
-    head: Annotated[Head, typer.Option(help="fixed: the cameras are head-mounted.")] = "free",
-    focal: Annotated[Focal, typer.Option(help="free: estimate focal lengths from the take.")] = "known",
+    head: Annotated[Head, Option(help="fixed: the cameras are head-mounted.")] = "free",
+    focal: Annotated[Focal, Option(help="free: estimate focal lengths from the take.")] = "known",
     skin: SkinFile = None,
     face: FaceFile = None,
     face_fps: Fps = None,
@@ -140,7 +136,7 @@ def _skin_options(
     if skin is not None and face is not None:
         return SkinOptions(skin, face, fps, offset_s, unit, options.rigid_bodies(rigid), rest_frame, only)
     if skin is not None or face is not None or only:
-        raise typer.BadParameter("needs both --skin and --face.", param_hint="--skin")
+        raise BadParameter("needs both --skin and --face.", param_hint="--skin")
     return None
 
 
@@ -188,17 +184,17 @@ def live(
     shot: ShotArg,
     source: Annotated[
         list[str] | None,
-        typer.Option(
+        Option(
             metavar="NAME=SOURCE",
             help="Source of a camera: NAME=/dev/video0, NAME=rtsp://..., NAME=FILE. Cameras without a source are not "
             "used; without any source, the shot's videos are played in real time.",
         ),
     ] = None,
-    osc: Annotated[str | None, typer.Option(metavar="HOST:PORT", help="OSC messages: /jaw/d, /jaw/sigma, ...")] = None,
-    view: Annotated[bool, typer.Option("--view", help="Also show the jaw in a page on this machine.")] = False,
-    port: Annotated[int, typer.Option(min=0, max=65535, help="Port of the page, or the next free port.")] = 8080,
-    head: Annotated[Head, typer.Option(help="fixed: the cameras are head-mounted.")] = "free",
-    seconds: Annotated[float | None, typer.Option(min=0.1, help="Stop after this time [s].")] = None,
+    osc: Annotated[str | None, Option(metavar="HOST:PORT", help="OSC messages: /jaw/d, /jaw/sigma, ...")] = None,
+    view: Annotated[bool, Option("--view", help="Also show the jaw in a page on this machine.")] = False,
+    port: Annotated[int, Option(min=0, max=65535, help="Port of the page, or the next free port.")] = 8080,
+    head: Annotated[Head, Option(help="fixed: the cameras are head-mounted.")] = "free",
+    seconds: Annotated[float | None, Option(min=0.1, help="Stop after this time [s].")] = None,
     skin: SkinFile = None,
     face: LiveFaceFile = None,
     face_fps: Fps = None,
@@ -206,7 +202,7 @@ def live(
     rigid: Rigid = None,
     rest_frame: RestFrame = None,
     length_unit: options.UnitOption = "mm",
-    silence: Annotated[float, typer.Option(min=0.1, help="Maximum time without an image from a source [s].")] = 10.0,
+    silence: Annotated[float, Option(min=0.1, help="Maximum time without an image from a source [s].")] = 10.0,
     jobs: options.Jobs = 2,
     allow_outside: options.Outside = False,
     prim: options.Prim = None,

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
-import typer
+from typer import Argument, BadParameter, Option
 
 from jawusd.base.arrays import Array
 from jawusd.base.errors import JawusdError
@@ -28,11 +28,9 @@ if TYPE_CHECKING:
 
 MandiblePrim = Annotated[
     str | None,
-    typer.Option("--mandible", help="For a stage: prim above the mandible's meshes, if names do not identify it."),
+    Option("--mandible", help="For a stage: prim above the mandible's meshes, if names do not identify it."),
 ]
-SkullPrim = Annotated[
-    str | None, typer.Option("--skull", help="For a stage: prim above the meshes of skull or upper teeth.")
-]
+SkullPrim = Annotated[str | None, Option("--skull", help="For a stage: prim above the meshes of skull or upper teeth.")]
 #: Sources from which a motion can be read.
 Origin = Literal["d", "mandible"]
 _ORIGINS: dict[Origin, str] = {"d": "values of d", "mandible": "mandible's transforms"}
@@ -41,9 +39,9 @@ _ORIGINS: dict[Origin, str] = {"d": "values of d", "mandible": "mandible's trans
 def encode(
     rig: options.RigArg,
     poses: Annotated[
-        Path, typer.Argument(help="CSV or JSON of poses, tracks.npz, or a stage, .fbx or .glb with the actor's meshes.")
+        Path, Argument(help="CSV or JSON of poses, tracks.npz, or a stage, .fbx or .glb with the actor's meshes.")
     ],
-    out: Annotated[Path, typer.Option("-o", "--out", help="CSV of frame, d1, d2, d3, residual_mm, margin_mm.")] = Path(
+    out: Annotated[Path, Option("-o", "--out", help="CSV of frame, d1, d2, d3, residual_mm, margin_mm.")] = Path(
         "d.csv"
     ),
     mandible: MandiblePrim = None,
@@ -133,7 +131,7 @@ def _fitted(
     _refuse_model(rig)
     if rig.resolve() == stage.resolve():
         message = f"the meshes of {stage} deform and must be fitted to those of the rig: give the rig before the stage."
-        raise typer.BadParameter(message, param_hint="RIG")
+        raise BadParameter(message, param_hint="RIG")
     found = fit_poses_of_stage(stage, rig, mandible, skull, prim)
     d, residual_mm = loaded.encode(found.T)
     return StageMotion(found.frames.astype(float), d, found.fps, "mandible", residual_mm, fitted=True)
@@ -141,7 +139,7 @@ def _fitted(
 
 def _refuse_model(rig: Path) -> None:
     if rig.suffix.lower() not in options.USD_SUFFIXES:
-        raise typer.BadParameter("must be the rig's USD file, because its meshes are needed.", param_hint="RIG")
+        raise BadParameter("must be the rig's USD file, because its meshes are needed.", param_hint="RIG")
 
 
 def judged_motion(rig: JawRig, frames: Array, d: Array, residual_mm: Array) -> dict[str, float]:
@@ -189,20 +187,20 @@ def judged_lines(judged: dict[str, float]) -> list[str]:
 def rebake(
     rig: Annotated[
         Path,
-        typer.Argument(
+        Argument(
             help="The shot; or the rig, if STAGE is FBX, glTF or a stage with copies of the rig's meshes.",
             metavar="SHOT | RIG STAGE",
             callback=options.rig_of_folder,
         ),
     ],
-    stage: Annotated[Path | None, typer.Argument(help="Shot or animation layer, or an export of it.")] = None,
-    out: Annotated[Path | None, typer.Option("-o", "--out", help="Layer to write. Default: <shot>_baked.usdc.")] = None,
-    root: Annotated[bool, typer.Option("--root", help="Make the layer a new root that sublayers the shot.")] = False,
-    origin: Annotated[Origin | None, typer.Option("--from", help="Source to use if d and mandible disagree.")] = None,
+    stage: Annotated[Path | None, Argument(help="Shot or animation layer, or an export of it.")] = None,
+    out: Annotated[Path | None, Option("-o", "--out", help="Layer to write. Default: <shot>_baked.usdc.")] = None,
+    root: Annotated[bool, Option("--root", help="Make the layer a new root that sublayers the shot.")] = False,
+    origin: Annotated[Origin | None, Option("--from", help="Source to use if d and mandible disagree.")] = None,
     mandible: MandiblePrim = None,
     skull: SkullPrim = None,
     prim: Annotated[
-        list[str] | None, typer.Option("--prim", metavar="PRIM", help="Prim paths of the rigs to bake. Default: all.")
+        list[str] | None, Option("--prim", metavar="PRIM", help="Prim paths of the rigs to bake. Default: all.")
     ] = None,
     allow: options.Allow = None,
     force: options.Force = False,
@@ -244,9 +242,7 @@ class _BakedRig:
 def _rigs_of(rig: Path, stage: Path | None, prims: list[str] | None) -> list[str | None]:
     """Return the prims to bake: those given, otherwise all rigs of the shot; None stands for the only rig or RIG."""
     if stage is not None and len(prims or ()) > 1:
-        raise typer.BadParameter(
-            "RIG STAGE bakes one rig; to bake several rigs, give only the shot.", param_hint="--prim"
-        )
+        raise BadParameter("RIG STAGE bakes one rig; to bake several rigs, give only the shot.", param_hint="--prim")
     if prims or stage is not None:
         return [*prims] if prims else [None]
     from jawusd.rig.layout import rig_prims
