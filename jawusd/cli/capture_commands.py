@@ -283,8 +283,7 @@ def plates(
 
 def photos(
     outlines: Annotated[
-        list[Path],
-        Argument(help="An image per photograph: tooth outlines as bright lines on black, or filled teeth."),
+        list[Path], Argument(help="An image per photograph: tooth outlines as bright lines on black, or filled teeth.")
     ],
     upper_teeth: Annotated[Path, Option(help="Scan of the upper teeth, in any frame.")],
     lower_teeth: Annotated[Path, Option(help="Scan of the lower teeth, in any frame.")],

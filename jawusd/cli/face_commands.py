@@ -65,8 +65,7 @@ Rigid = Annotated[
     ),
 ]
 RestFrame = Annotated[
-    int | None,
-    Option(help="For --rigid: number of the frame of the face data that defines the marker positions."),
+    int | None, Option(help="For --rigid: number of the frame of the face data that defines the marker positions.")
 ]
 HeadError = Annotated[
     tuple[float, float],

@@ -37,8 +37,7 @@ def _root(
     version: Annotated[bool, Option("--version", help="Print the version and exit.")] = False,
     verbose: Annotated[bool, Option("--verbose", "-v", help="Also print the traceback of an error.")] = False,
     log: Annotated[
-        Path | None,
-        Option("--log", metavar="FILE", help="Also write the output, with times and versions, to a file."),
+        Path | None, Option("--log", metavar="FILE", help="Also write the output, with times and versions, to a file.")
     ] = None,
 ) -> None:
     if version:

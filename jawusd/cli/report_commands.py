@@ -115,8 +115,7 @@ def _report_found(
 
 
 PageOption = Annotated[
-    Path | None,
-    Option(help="Write a web page that poses the rig without a server, and exit.", metavar="FILE.html"),
+    Path | None, Option(help="Write a web page that poses the rig without a server, and exit.", metavar="FILE.html")
 ]
 
 
@@ -130,8 +129,7 @@ def view(
         ),
     ] = None,
     tracks: Annotated[
-        Path | None,
-        Option(help="Poses to draw over the footage of a capture: the folder of its build, or tracks.npz."),
+        Path | None, Option(help="Poses to draw over the footage of a capture: the folder of its build, or tracks.npz.")
     ] = None,
     host: Annotated[
         str, Option(help="Address to listen on; the default accepts connections only from this machine.")

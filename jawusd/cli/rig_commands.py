@@ -39,8 +39,7 @@ def info(
     context: Context,
     rig: options.OptionalRigArg = None,
     schema: Annotated[
-        bool,
-        Option("--schema", help="Print the path of the USD schema JawRigAPI, and how other programs find it."),
+        bool, Option("--schema", help="Print the path of the USD schema JawRigAPI, and how other programs find it.")
     ] = False,
     frame: Annotated[int | None, Option(help="For tracks.npz: describe the tracking of this frame.")] = None,
     prim: options.Prim = None,
@@ -119,8 +118,7 @@ def _info_lines(found: Description) -> list[str]:
 def pose(
     rig: options.RigArg,
     d: Annotated[
-        Triple,
-        Option("--d", metavar="D1 D2 D3", help="Opening, laterotrusion (+ left), protrusion (+ forward) [mm]."),
+        Triple, Option("--d", metavar="D1 D2 D3", help="Opening, laterotrusion (+ left), protrusion (+ forward) [mm].")
     ],
     prim: options.Prim = None,
     allow: options.Allow = None,

@@ -27,8 +27,7 @@ if TYPE_CHECKING:
 
 
 MandiblePrim = Annotated[
-    str | None,
-    Option("--mandible", help="For a stage: prim above the mandible's meshes, if names do not identify it."),
+    str | None, Option("--mandible", help="For a stage: prim above the mandible's meshes, if names do not identify it.")
 ]
 SkullPrim = Annotated[str | None, Option("--skull", help="For a stage: prim above the meshes of skull or upper teeth.")]
 #: Sources from which a motion can be read.

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from jawusd.base.arrays import Array
-from jawusd.base.errors import FormatError, JawusdError
+from jawusd.base.errors import AnyPath, FormatError, JawusdError
 from jawusd.base.npz import check_format
 from jawusd.evaluator import JawRig
 from jawusd.formats.atomic import write_text_atomic
@@ -81,7 +81,7 @@ class Library:
         return tuple(e for e in self.entries if text.lower() in e.actor.lower() or text.lower() in e.path.lower())
 
 
-def scan_library(folder: str | os.PathLike[str], load: Loader) -> Library:
+def scan_library(folder: AnyPath, load: Loader) -> Library:
     """Scan a folder and update its index.
 
     Every subfolder with a `model.npz` or, without it, an `actor.usda`, is one subject. Links out of the folder are not

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import contextlib
-import os
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from typing_extensions import TypedDict
 
-from jawusd.base.errors import explain_missing_packages, naming_file
+from jawusd.base.errors import AnyPath, explain_missing_packages, naming_file
 from jawusd.formats.capture import Capture
 from jawusd.formats.finding import Finding, FoundJson
 from jawusd.formats.model import load_model, save_model
@@ -85,8 +84,8 @@ REPORT = Stage("report", ReportSummary, 15.0)
 
 @explain_missing_packages()
 def build(
-    capture: Capture | str | os.PathLike[str],
-    out: str | os.PathLike[str],
+    capture: Capture | AnyPath,
+    out: AnyPath,
     options: BuildOptions = BuildOptions(),
     progress: Progress | None = None,
     tell: Callable[[Finding], None] | None = None,
@@ -255,7 +254,7 @@ class PlannedStage:
 
 
 @explain_missing_packages()
-def plan_build(capture: Capture | str | os.PathLike[str], out: Path, options: BuildOptions) -> list[PlannedStage]:
+def plan_build(capture: Capture | AnyPath, out: Path, options: BuildOptions) -> list[PlannedStage]:
     """Return the stages of a build in order; nothing is written.
 
     Raises:

@@ -17,7 +17,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import NamedTuple, TypedDict
 
-from jawusd.base.errors import CaptureError, JawusdError
+from jawusd.base.errors import AnyPath, CaptureError, JawusdError
 from jawusd.base.guard import machine_memory, memory_limit
 from jawusd.base.version import __version__
 from jawusd.formats.capture import Capture, read_capture
@@ -77,8 +77,8 @@ _CHECKS = (
 
 
 def check_capture(
-    capture: Capture | str | os.PathLike[str],
-    out: str | os.PathLike[str] | None = None,
+    capture: Capture | AnyPath,
+    out: AnyPath | None = None,
     *,
     allow_outside: bool = False,
     progress: Progress | None = None,

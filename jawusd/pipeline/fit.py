@@ -10,7 +10,6 @@ frame of landmarks digitised on the mandible to the frame of the upper model.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
@@ -23,7 +22,7 @@ from numpy.typing import NDArray
 from typing_extensions import TypedDict
 
 from jawusd.base.arrays import Array
-from jawusd.base.errors import FormatError, errors_name_file, explain_missing_packages
+from jawusd.base.errors import AnyPath, FormatError, errors_name_file, explain_missing_packages
 from jawusd.formats.model import JawModel
 from jawusd.formats.poses import read_poses
 from jawusd.formats.tracks import Tracks, load_tracks
@@ -138,9 +137,7 @@ def fit_summary(model: JawModel) -> FitSummary:
     return cast(FitSummary, found)  # the values of meta are untyped JSON
 
 
-def read_motion(
-    path: str | os.PathLike[str], options: TrajectoryOptions = TrajectoryOptions()
-) -> tuple[Tracks | Poses, float | None]:
+def read_motion(path: AnyPath, options: TrajectoryOptions = TrajectoryOptions()) -> tuple[Tracks | Poses, float | None]:
     """Read tracks from tracks.npz, or poses and their frame rate from any other file; see `read_trajectory`.
 
     Raises:
@@ -156,9 +153,7 @@ def read_motion(
 
 
 @errors_name_file
-def read_trajectory(
-    path: str | os.PathLike[str], options: TrajectoryOptions
-) -> tuple[NDArray[np.int64], Array, float | None]:
+def read_trajectory(path: AnyPath, options: TrajectoryOptions) -> tuple[NDArray[np.int64], Array, float | None]:
     """Read poses from a CSV or JSON table, a table of markers, or an HDF5 file (.h5, .hdf5) of jaw-tracking-system.
 
     Returns frame numbers, shape (F,); T_skull_mandible [mm], shape (F, 4, 4), NaN where there is no pose; and the frame
@@ -202,7 +197,7 @@ def _pose_at(frames: NDArray[np.int64], T: Array, wanted: int) -> Array:
 
 @explain_missing_packages()
 @errors_name_file
-def read_hdf5(path: str | os.PathLike[str], group: str | None = None) -> Poses:
+def read_hdf5(path: AnyPath, group: str | None = None) -> Poses:
     """Read a trajectory of jaw-tracking-system: poses of the landmark frame in the model frame, numbered from 0.
 
     Args:

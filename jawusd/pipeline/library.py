@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -14,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jawusd.base.arrays import Array, Mask
-from jawusd.base.errors import EvaluatorError, FormatError, OutputError, explain_missing_packages
+from jawusd.base.errors import AnyPath, EvaluatorError, FormatError, OutputError, explain_missing_packages
 from jawusd.evaluator import JawRig, load
 from jawusd.evaluator.bounds import SMALLEST_REACH_MM
 from jawusd.evaluator.kinds import HELD_OUT_ARRAYS
@@ -49,12 +48,12 @@ def load_any_rig(path: Path) -> JawRig:
     return load_rig(path)
 
 
-def open_library(folder: str | os.PathLike[str]) -> Library:
+def open_library(folder: AnyPath) -> Library:
     """Scan a folder with one subfolder per subject, and update its index; see `library.index.scan_library`."""
     return scan_library(folder, load_any_rig)
 
 
-def add_rig(folder: str | os.PathLike[str], source: Path, name: str | None, force: bool) -> Path:
+def add_rig(folder: AnyPath, source: Path, name: str | None, force: bool) -> Path:
     """Copy a rig into a library, as the model file `NAME/model.npz` (default: the name in the rig); return that file.
 
     Raises:

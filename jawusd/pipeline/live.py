@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from contextlib import ExitStack
@@ -11,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 import jawusd
-from jawusd.base.errors import CaptureError, OutputError, explain_missing_packages, naming_file
+from jawusd.base.errors import AnyPath, CaptureError, OutputError, explain_missing_packages, naming_file
 from jawusd.evaluator import JawRig
 from jawusd.formats.capture import Capture
 from jawusd.formats.performance import SolveState
@@ -40,8 +39,8 @@ _BEFORE = 6  # number of frames tracked before playback of files begins, to esti
 
 @explain_missing_packages()
 def live(
-    rig: str | os.PathLike[str],
-    shot: Capture | str | os.PathLike[str],
+    rig: AnyPath,
+    shot: Capture | AnyPath,
     sources: Mapping[str, str] | None = None,
     *,
     prim: str | None = None,

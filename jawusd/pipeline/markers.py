@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import struct
 from collections.abc import Mapping
 from pathlib import Path
@@ -10,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from jawusd.base.arrays import Array
-from jawusd.base.errors import FormatError, errors_name_file, explain_missing_packages, naming_file
+from jawusd.base.errors import AnyPath, FormatError, errors_name_file, explain_missing_packages, naming_file
 from jawusd.base.inputs import check_input
 from jawusd.formats.markers import MarkerTable, RigidBody, length_unit, mark_hidden, read_body, read_markers
 from jawusd.geometry import rigid_fits, se3_inverse, transform_points
@@ -30,7 +29,7 @@ _FARTHEST_MM = 1.0
 
 
 def marker_poses(
-    path: str | os.PathLike[str], rigid: Mapping[str, str], rest_frame: int | None = None, unit: str = "mm"
+    path: AnyPath, rigid: Mapping[str, str], rest_frame: int | None = None, unit: str = "mm"
 ) -> tuple[Array, float | None]:
     """Return T_head_jaw (F, 4, 4) [mm] from a table of markers, NaN where a rigid body is occluded, and the frame rate.
 
@@ -73,7 +72,7 @@ def in_head(
 
 @explain_missing_packages()
 @errors_name_file
-def read_c3d(path: str | os.PathLike[str]) -> MarkerTable:
+def read_c3d(path: AnyPath) -> MarkerTable:
     """Read the points of a C3D file; points with a negative residual are occluded (https://www.c3d.org).
 
     Raises:

@@ -12,7 +12,7 @@ from typing import TypeVar
 
 from typing_extensions import TypedDict
 
-from jawusd.base.errors import FormatError, JawusdError, MissingDependencyError, explain_missing_packages
+from jawusd.base.errors import AnyPath, FormatError, JawusdError, MissingDependencyError, explain_missing_packages
 from jawusd.formats.atomic import write_csv_atomic
 from jawusd.formats.capture import Capture
 from jawusd.formats.experiments import TABLE_COLUMNS, Experiments
@@ -157,7 +157,7 @@ def _without_pictures(
 
 def report_build(
     folder: Path,
-    capture: str | os.PathLike[str] | None,
+    capture: AnyPath | None,
     progress: Progress,
     experiments: Experiments | None = None,
     *,

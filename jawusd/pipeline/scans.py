@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TypedDict
@@ -10,7 +9,7 @@ from typing import TypedDict
 import numpy as np
 from numpy.typing import NDArray
 
-from jawusd.base.errors import explain_missing_packages
+from jawusd.base.errors import AnyPath, explain_missing_packages
 from jawusd.formats.atomic import refuse_existing
 from jawusd.formats.capture import Capture, Scans
 from jawusd.formats.mesh import Mesh, ScanLabels, labels_path, painted_labels, save_scan_labels, tooth_labels
@@ -48,8 +47,8 @@ class ScansSummary(TypedDict):
 
 @explain_missing_packages()
 def label_scans(
-    capture: Capture | str | os.PathLike[str],
-    out: str | os.PathLike[str] | None = None,
+    capture: Capture | AnyPath,
+    out: AnyPath | None = None,
     *,
     force: bool = False,
     allow_outside: bool = False,

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from jawusd.base.arrays import Array, Mask
-from jawusd.base.errors import FormatError, errors_name_file, naming_file
+from jawusd.base.errors import AnyPath, FormatError, errors_name_file, naming_file
 from jawusd.base.tables import read_table
 from jawusd.evaluator import JawRig
 from jawusd.evaluator.skin import Skin, load_skin
@@ -33,8 +33,8 @@ _LARGEST_SIGMA_MM = 1.0  # standard deviation at the incisal point above which a
 class SkinOptions:
     """Facial-skin inputs of `solve`."""
 
-    skin: str | os.PathLike[str]  # the map from skin to d, written by `jawusd skin-fit`
-    face: str | os.PathLike[str]  # facial motion during the shot; it has the columns from which the map was learned
+    skin: AnyPath  # the map from skin to d, written by `jawusd skin-fit`
+    face: AnyPath  # facial motion during the shot; it has the columns from which the map was learned
     fps: float | None = None  # frame rate of the face data [1/s], if the file does not state it
     offset_s: float | None = None  # seconds from frame 0 of the shot to frame 0 of the face data; None: estimated
     unit: str = "mm"  # see `read_face`
@@ -69,7 +69,7 @@ class JawTake:
         )
 
 
-def read_jaw(rig: JawRig, path: str | os.PathLike[str]) -> JawTake:
+def read_jaw(rig: JawRig, path: AnyPath) -> JawTake:
     """Read the jaw motion of a take from tracks.npz, the CSV of a solved performance, or a table of d or poses.
 
     In tracks, frames count as seen if both arches were tracked without a prior; in a performance, if they are solved;
@@ -114,7 +114,7 @@ def _of_tracks(rig: JawRig, tracks: Tracks) -> JawTake:
     return JawTake(frames, d, seen, sigma, fps)
 
 
-def load_own_skin(rig: JawRig, path: str | os.PathLike[str]) -> Skin:
+def load_own_skin(rig: JawRig, path: AnyPath) -> Skin:
     """Read a map from skin to d; raises FormatError if it is invalid or was not learned with this rig."""
     skin = load_skin(path)
     if skin.actor != rig.actor:
@@ -127,7 +127,7 @@ def load_own_skin(rig: JawRig, path: str | os.PathLike[str]) -> Skin:
     return skin
 
 
-def own_columns(skin: Skin, map_path: str | os.PathLike[str], face: FaceTable, path: str | os.PathLike[str]) -> Array:
+def own_columns(skin: Skin, map_path: AnyPath, face: FaceTable, path: AnyPath) -> Array:
     """Return the columns (F, K) or points (F, N, 3) from which a map was learned, found in face data by name.
 
     Args:
@@ -155,7 +155,7 @@ def own_columns(skin: Skin, map_path: str | os.PathLike[str], face: FaceTable, p
 
 
 def read_face(
-    path: str | os.PathLike[str],
+    path: AnyPath,
     fps: float | None = None,
     unit: str = "mm",
     rigid: Mapping[str, str] | None = None,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from functools import partial
 from pathlib import Path
 from typing import Literal, NotRequired, TypedDict, cast
@@ -11,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import jawusd
-from jawusd.base.errors import OutputError, RigError, TrackingError, explain_missing_packages, naming_file
+from jawusd.base.errors import AnyPath, OutputError, RigError, TrackingError, explain_missing_packages, naming_file
 from jawusd.evaluator import JawRig
 from jawusd.evaluator.verdicts import is_inside
 from jawusd.formats.capture import Capture
@@ -72,13 +71,13 @@ class SolveSummary(TypedDict):
 
 @explain_missing_packages()
 def solve(
-    rig: str | os.PathLike[str],
-    shot: Capture | str | os.PathLike[str],
-    out: str | os.PathLike[str] | None = None,
+    rig: AnyPath,
+    shot: Capture | AnyPath,
+    out: AnyPath | None = None,
     *,
     prim: str | None = None,
-    overlay: str | os.PathLike[str] | None = None,
-    report: str | os.PathLike[str] | None = None,
+    overlay: AnyPath | None = None,
+    report: AnyPath | None = None,
     fixed_head: bool = False,
     free_focal: bool = False,
     jobs: int = 2,
@@ -188,12 +187,7 @@ def _from_skin(capture: Capture, jaw: JawRig, skin: SkinOfShot) -> tuple[Perform
 
 @explain_missing_packages()
 def write_solved(
-    out: str | os.PathLike[str],
-    performance: Performance,
-    jaw: JawRig,
-    rig: str | os.PathLike[str],
-    fps: float,
-    prim: str | None = None,
+    out: AnyPath, performance: Performance, jaw: JawRig, rig: AnyPath, fps: float, prim: str | None = None
 ) -> None:
     """Write a performance to a file whose suffix selects the format; see `solve`.
 
@@ -217,10 +211,7 @@ def write_solved(
 
 
 def check_output(
-    rig: str | os.PathLike[str],
-    out: str | os.PathLike[str] | None,
-    overlay: str | os.PathLike[str] | None = None,
-    report: str | os.PathLike[str] | None = None,
+    rig: AnyPath, out: AnyPath | None, overlay: AnyPath | None = None, report: AnyPath | None = None
 ) -> None:
     """Check, before any work, the suffixes of the output files: performance, overlay and report.
 

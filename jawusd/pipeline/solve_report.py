@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
-from jawusd.base.errors import FormatError, OutputError, explain_missing_packages, naming_file
+from jawusd.base.errors import AnyPath, FormatError, OutputError, explain_missing_packages, naming_file
 from jawusd.formats.atomic import write_text_atomic
 from jawusd.formats.capture import Capture
 from jawusd.formats.performance import SolveState
@@ -27,7 +26,7 @@ _MOST_UNSEEN, _MOST_UNCERTAIN, _MOST_OUTSIDE = 3, 2, 2  # number of frames drawn
 
 
 @explain_missing_packages()
-def check_page(path: str | os.PathLike[str]) -> None:
+def check_page(path: AnyPath) -> None:
     """Raise OutputError unless a file name ends in .html, and MissingDependencyError if packages are missing."""
     import jawusd.report.solve_page  # noqa: F401
 
@@ -36,7 +35,7 @@ def check_page(path: str | os.PathLike[str]) -> None:
 
 
 def report_solve(
-    tracks: Path, capture: str | os.PathLike[str] | None, page: Path, progress: Progress, *, allow_outside: bool = False
+    tracks: Path, capture: AnyPath | None, page: Path, progress: Progress, *, allow_outside: bool = False
 ) -> Path:
     """Write the report of a solve from the .npz file of its tracks; return the path of the page.
 
@@ -62,7 +61,7 @@ def report_solve(
 
 @explain_missing_packages()
 def write_solve_report(
-    page: str | os.PathLike[str],
+    page: AnyPath,
     tracks: Tracks,
     capture: Capture | None,
     offsets: Mapping[str, int],

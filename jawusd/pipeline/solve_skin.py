@@ -10,7 +10,7 @@ from math import ceil, floor
 import numpy as np
 
 from jawusd.base.arrays import Array, Mask
-from jawusd.base.errors import FittingError
+from jawusd.base.errors import AnyPath, FittingError
 from jawusd.capture.skin_points import SkinTracker
 from jawusd.evaluator import JawRig
 from jawusd.evaluator.skin import SkinJaw
@@ -85,7 +85,7 @@ class SkinOfShot:
         return self.offset_s
 
 
-def check_agreement(face: str | os.PathLike[str], found: SkinJaw, d: Array) -> None:
+def check_agreement(face: AnyPath, found: SkinJaw, d: Array) -> None:
     """Check that d from skin agrees with d (F, 3) [mm] from visible teeth, in frames with a familiar face.
 
     Raises FittingError if the two differ by much more than their expected error.

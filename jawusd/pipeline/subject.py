@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -12,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from jawusd.base.arrays import Array
-from jawusd.base.errors import CaptureError, explain_missing_packages
+from jawusd.base.errors import AnyPath, CaptureError, explain_missing_packages
 from jawusd.formats.capture import Capture
 from jawusd.formats.finding import Finding
 from jawusd.formats.landmarks import load_landmarks
@@ -263,7 +262,7 @@ def _measured(
     return Subject(name, T_anatomical_skull, landmarks, meshes, fps, inferred=tuple(inferred))
 
 
-def subject_of_landmarks(path: str | os.PathLike[str], name: str) -> Subject:
+def subject_of_landmarks(path: AnyPath, name: str) -> Subject:
     """Return the subject described by a landmarks file (jawusd-landmarks/1); errors are measured at landmarks.
 
     Raises like `formats.landmarks.load_landmarks`.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, NotRequired, cast
@@ -10,7 +9,7 @@ from typing import TYPE_CHECKING, Literal, NotRequired, cast
 import numpy as np
 from typing_extensions import TypedDict
 
-from jawusd.base.errors import TrackingError, explain_missing_packages, naming_file
+from jawusd.base.errors import AnyPath, TrackingError, explain_missing_packages, naming_file
 from jawusd.evaluator import JawRig
 from jawusd.formats.capture import Capture
 from jawusd.formats.model import JawModel
@@ -67,13 +66,13 @@ class FrameTrackSummary(TypedDict):
 
 
 def track(
-    capture: Capture | str | os.PathLike[str],
-    out: str | os.PathLike[str] | None = None,
+    capture: Capture | AnyPath,
+    out: AnyPath | None = None,
     *,
     solver: str = "contour",
     backend: str = "cpu",
     model: JawModel | None = None,
-    overlay: str | os.PathLike[str] | None = None,
+    overlay: AnyPath | None = None,
     jobs: int = 2,
     allow_outside: bool = False,
     progress: Progress | None = None,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 from functools import cached_property, partial
 from pathlib import Path
@@ -12,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jawusd.base.arrays import Array, Mask
-from jawusd.base.errors import CaptureError, FormatError, OutputError, RigError, explain_missing_packages
+from jawusd.base.errors import AnyPath, CaptureError, FormatError, OutputError, RigError, explain_missing_packages
 from jawusd.evaluator import JawRig
 from jawusd.formats.atomic import refuse_existing
 from jawusd.formats.keys import DEFAULT_FPS
@@ -36,7 +35,7 @@ _MOST_FACES = 8_000  # maximum number of faces of a mesh; browsers without a GPU
 
 @explain_missing_packages()
 def open_viewer(
-    path: str | os.PathLike[str] | None,
+    path: AnyPath | None,
     host: str,
     port: int,
     prim: str | None = None,
@@ -54,7 +53,7 @@ def open_viewer(
     return Viewer(partial(viewed_actor, path, prim), host, port, play=play, first=first)
 
 
-def viewed_actor(path: str | os.PathLike[str] | None, prim: str | None = None) -> ViewedActor:
+def viewed_actor(path: AnyPath | None, prim: str | None = None) -> ViewedActor:
     """Load a rig for the viewer.
 
     Args:
@@ -103,7 +102,7 @@ def is_capture(path: Path) -> bool:
     return path.suffix == ".toml" or (path / CAPTURE_FILE).is_file()
 
 
-def rig_file(path: str | os.PathLike[str] | None) -> Path:
+def rig_file(path: AnyPath | None) -> Path:
     """Return the file of a rig, given that file or the folder of a build; None: the example rig."""
     if path is None:
         from jawusd.rig.layout import EXAMPLE_RIG
@@ -224,9 +223,7 @@ _TILE_PX, _MOST_IMAGES, _QUALITY = (320, 240), 150, 50
 
 
 @explain_missing_packages()
-def write_page(
-    path: str | os.PathLike[str] | None, out: Path, prim: str | None = None, *, footage: bool = False
-) -> None:
+def write_page(path: AnyPath | None, out: Path, prim: str | None = None, *, footage: bool = False) -> None:
     """Write a page that poses the rig at a path, with the footage of its take if wanted; raises like `viewed_actor`.
 
     Raises CaptureError if there is no footage, RigError if contacts cannot be computed, and OutputError.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import threading
 from collections.abc import Callable, Mapping
 from functools import cache, partial
@@ -13,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jawusd.base.arrays import Array
-from jawusd.base.errors import FormatError, explain_missing_packages, naming_file
+from jawusd.base.errors import AnyPath, FormatError, explain_missing_packages, naming_file
 from jawusd.formats.capture import Bootstrap, Capture
 from jawusd.formats.capture_writing import write_bootstrap
 from jawusd.formats.mesh import Mesh
@@ -40,7 +39,7 @@ _TILE_PX = (480, 360)  # maximum size of a camera's tile; three tiles fill the w
 
 
 def viewed_capture(
-    path: str | os.PathLike[str], tracks: Path | None, progress: Progress, *, allow_outside: bool = False
+    path: AnyPath, tracks: Path | None, progress: Progress, *, allow_outside: bool = False
 ) -> ViewedCapture:
     """Load a capture for the viewer.
 

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Generic
 
-from jawusd.base.errors import CaptureError, JawusdError, OutputError
+from jawusd.base.errors import AnyPath, CaptureError, JawusdError, OutputError
 from jawusd.base.guard import trim_memory
 from jawusd.base.version import __version__
 from jawusd.cameras.files import calibration_files
@@ -33,7 +32,7 @@ from jawusd.pipeline.state import (
 from jawusd.pipeline.subject import BONES, TEETH
 
 
-def open_capture(capture: Capture | str | os.PathLike[str], *, allow_outside: bool = False) -> Capture:
+def open_capture(capture: Capture | AnyPath, *, allow_outside: bool = False) -> Capture:
     """Return a capture, loading it from capture.toml or its folder if needed; see `formats.capture.load_capture`."""
     return capture if isinstance(capture, Capture) else load_capture(capture, allow_outside=allow_outside)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
 from typing import cast
 
@@ -10,6 +9,7 @@ import numpy as np
 from markupsafe import Markup
 from numpy.typing import NDArray
 
+from jawusd.base.errors import AnyPath
 from jawusd.formats.atomic import write_text_atomic
 from jawusd.formats.finding import Finding
 from jawusd.formats.mesh import DEEP, TOUCHING
@@ -26,9 +26,7 @@ _LISTED = 60  # maximum number of frame ranges in a list
 _PLACES = ("mandible", "incisor", "molar_left", "molar_right", "condyle_left", "condyle_right")
 
 
-def write_document(
-    path: str | os.PathLike[str], data: ReportData, figures: Mapping[str, Markup] | None = None
-) -> BuildVerdict:
+def write_document(path: AnyPath, data: ReportData, figures: Mapping[str, Markup] | None = None) -> BuildVerdict:
     """Write the report to an HTML file and return its summary; raises OutputError.
 
     `figures` are plots by their slot on the page; default: those of `draw_figures`.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -12,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jawusd.base.arrays import Array
+from jawusd.base.errors import AnyPath
 from jawusd.evaluator import JawRig
 from jawusd.evaluator.contact import AUTHORED_MM, UNIT_MM, ContactField
 from jawusd.evaluator.motions import motions_of_poses
@@ -100,7 +100,7 @@ class PosePage:
     footage: Mapping[str, object] | None = None
 
 
-def write_pose_page(path: str | os.PathLike[str], page: PosePage) -> None:
+def write_pose_page(path: AnyPath, page: PosePage) -> None:
     """Write the page to an HTML file, with text from the rig escaped; raises OutputError."""
     text = rendered("pose.html.j2", _SCRIPTS, name=page.name, data=pose_data(page), marks=(*TOUCHING, DEEP))
     write_text_atomic(path, text)
