@@ -7,7 +7,6 @@ from collections.abc import Callable
 
 import numpy as np
 import viser
-from numpy.typing import NDArray
 
 from jawusd.base.arrays import Array
 from jawusd.base.errors import JawusdError
@@ -20,8 +19,8 @@ from jawusd.viewer.picking import ARCHES, PickingLayout, fit_view, hit_vertex, r
 from jawusd.viewer.scan_labels import BRUSHES, ScanLabelsPanel
 from jawusd.viewer.scene import PHONE
 from jawusd.viewer.server import PageServer
-from jawusd.viewer.viewed import Region, ViewedCapture
-from jawusd.viewer.widgets import begin_panel, errors_shown, guarded, limit_uploads
+from jawusd.viewer.viewed import Image, Poses, Region, ViewedCapture
+from jawusd.viewer.widgets import Client, begin_panel, errors_shown, guarded, limit_uploads
 
 _PANEL_PX = 370
 _SLOW_S = 0.3  # decoding time after which "loading" is displayed
@@ -36,7 +35,7 @@ class CapturePage:
     scans, by arch; `drawn` is the number of the redraw request that was drawn last.
     """
 
-    def __init__(self, client: viser.ClientHandle, capture: ViewedCapture) -> None:
+    def __init__(self, client: Client, capture: ViewedCapture) -> None:
         self.client, self._capture = client, capture
         gui = client.gui
         begin_panel(client, capture.source.name)
@@ -46,7 +45,7 @@ class CapturePage:
         self.drawn = self._wanted = 0
         self._aim = True
         self._drawing: asyncio.Task[None] | None = None
-        self._of_picks: tuple[Bootstrap, tuple[Array, Array] | None] | None = None
+        self._of_picks: tuple[Bootstrap, Poses | None] | None = None
         tabs = gui.add_tab_group()
         with tabs.add_tab("Footage"):
             self.footage = FootagePanel(client, capture, self._turn_camera, self.refresh)
@@ -125,13 +124,13 @@ class CapturePage:
         if aim:
             self._look()
 
-    def _show_partly(self) -> Callable[[NDArray[np.uint8]], None] | None:
+    def _show_partly(self) -> Callable[[Image], None] | None:
         """Return a thread-safe callback that shows a partial image of all cameras; None during playback."""
         if self.footage.player.playing:
             return None
         loop, layout = asyncio.get_running_loop(), self._lay_out(ALL, self.footage.frame)
 
-        def show(image: NDArray[np.uint8]) -> None:
+        def show(image: Image) -> None:
             loop.call_soon_threadsafe(self.scene.show_picture, image, layout)
 
         return show
@@ -156,7 +155,7 @@ class CapturePage:
             points = np.vstack([points, points - np.ptp(points @ UP) * np.array(UP)])
         self.scene.look(*fit_view(points, away, UP, aspect))
 
-    def _poses_at(self, frame: int) -> tuple[Array, Array] | None:
+    def _poses_at(self, frame: int) -> Poses | None:
         """Return T_world_upper and T_world_lower of a frame: tracked or, if untracked, fitted to that frame's picks."""
         tracked = self._capture.tracked_poses(frame)
         if tracked is None and self._of_picks is not None and self._of_picks[0].frame == frame:
@@ -269,5 +268,5 @@ class CaptureViewer(PageServer):
         super().__init__(capture.source.name, host, port)
         set_first_view(self._server)
 
-    async def _page(self, client: viser.ClientHandle) -> CapturePage:
+    async def _page(self, client: Client) -> CapturePage:
         return CapturePage(client, self._capture)

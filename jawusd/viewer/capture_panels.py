@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable
 
 import viser
 
 from jawusd.viewer.motion import Player
 from jawusd.viewer.picking import SIDES, PickBook
 from jawusd.viewer.plots import coverage_plot, frame_html, frames_to_inspect, plot_seek, solve_plot
-from jawusd.viewer.viewed import Look, ViewedCapture
-from jawusd.viewer.widgets import Choice, add_dark_checkbox, assign, enable, guarded, notify, small_text
+from jawusd.viewer.viewed import Callback, Look, ViewedCapture
+from jawusd.viewer.widgets import Choice, Client, add_dark_checkbox, assign, enable, guarded, notify, small_text
 
 SPACE, ALL = "3-D", "all cameras"
 _LOOKS: dict[str, Look] = {"outlines of the teeth": "outlines", "tinted teeth": "tinted", "footage alone": "footage"}
@@ -31,13 +30,7 @@ class FootagePanel:
     the frames to inspect, worst first.
     """
 
-    def __init__(
-        self,
-        client: viser.ClientHandle,
-        capture: ViewedCapture,
-        turned: Callable[[], None],
-        changed: Callable[[], None],
-    ) -> None:
+    def __init__(self, client: Client, capture: ViewedCapture, turned: Callback, changed: Callback) -> None:
         """Add the widgets to the current container; call `turned` if the view changes, else `changed`."""
         self._client, self._capture, self._turned, self._changed = client, capture, turned, changed
         self._loading = False
@@ -176,12 +169,7 @@ class PicksPanel:
     """Widgets for setting the picks; `side` of the scans faces the viewer, one of `picking.SIDES`."""
 
     def __init__(
-        self,
-        client: viser.ClientHandle,
-        capture: ViewedCapture,
-        footage: FootagePanel,
-        turned: Callable[[], None],
-        changed: Callable[[], None],
+        self, client: Client, capture: ViewedCapture, footage: FootagePanel, turned: Callback, changed: Callback
     ) -> None:
         """Add the widgets to the current container; call `turned` if the side changes, else `changed`."""
         self._client, self._capture, self._footage = client, capture, footage

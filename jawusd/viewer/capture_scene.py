@@ -6,14 +6,14 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 import viser
-from numpy.typing import NDArray
 
 from jawusd.base.arrays import Array, Mask
 from jawusd.geometry import wxyz_from_matrix
 from jawusd.geometry.se3 import se3_inverse
 from jawusd.viewer.picking import ARCHES, FOV_RAD, PickBook, PickingLayout
 from jawusd.viewer.scene import add_lights, set_pose
-from jawusd.viewer.viewed import ViewedCapture, for_view
+from jawusd.viewer.viewed import Image, ViewedCapture, for_view
+from jawusd.viewer.widgets import Client
 
 ENAMEL, GUM, BASE = (236, 229, 212), (196, 112, 108), (120, 135, 165)
 #: Colours of picks by arch, as in the outlines, and colour of the selected pick.
@@ -38,7 +38,7 @@ class CaptureScene:
     The page frame has the axes of the first camera, so that images are upright; `T_page_world` has shape (4, 4).
     """
 
-    def __init__(self, client: viser.ClientHandle, capture: ViewedCapture) -> None:
+    def __init__(self, client: Client, capture: ViewedCapture) -> None:
         self._client, self._scene, self._capture = client, client.scene, capture
         scene = client.scene
         self.T_page_world = next((camera.T_cam_world for camera in capture.cameras.values()), np.eye(4))
@@ -97,7 +97,7 @@ class CaptureScene:
                     receive_shadow=False,
                 )
 
-    def show_picture(self, image: NDArray[np.uint8], layout: PickingLayout) -> None:
+    def show_picture(self, image: Image, layout: PickingLayout) -> None:
         """Show an image in the layout."""
         width, height = (side / layout.px_per_mm for side in layout.size_px)
         if self._picture is None:
@@ -109,7 +109,7 @@ class CaptureScene:
             self._picture.image = image
             self._picture.render_width, self._picture.render_height = width, height
 
-    def show_thumbnail(self, name: str, image: NDArray[np.uint8]) -> None:
+    def show_thumbnail(self, name: str, image: Image) -> None:
         """Show a thumbnail in the frustum of a camera."""
         step = -(-image.shape[1] // _THUMB_PX)
         self._frustums[name].image = np.ascontiguousarray(image[::step, ::step])

@@ -18,8 +18,18 @@ from jawusd.formats.poses import read_parameters, write_parameters
 from jawusd.viewer.motion import Clip, KeyTrack, Player, with_key, without_key
 from jawusd.viewer.plots import Plot, curve_plot, plot_seek
 from jawusd.viewer.session import Interpolation, Session
-from jawusd.viewer.viewed import ViewedActor
-from jawusd.viewer.widgets import Choice, assign, errors_shown, guarded, limit_uploads, notify, small_text, upload_name
+from jawusd.viewer.viewed import Callback, ViewedActor
+from jawusd.viewer.widgets import (
+    Choice,
+    Client,
+    assign,
+    errors_shown,
+    guarded,
+    limit_uploads,
+    notify,
+    small_text,
+    upload_name,
+)
 
 KEYS = "keys"
 _LENGTH = 100
@@ -29,7 +39,7 @@ _MOST_THUMBS = 40  # maximum number of keys that are shown in a multi-slider
 class Playback:
     """A line with the name and current frame of the motion, and a button that plays and pauses it."""
 
-    def __init__(self, client: viser.ClientHandle) -> None:
+    def __init__(self, client: Client) -> None:
         self._line = client.gui.add_html("")
         self.button = client.gui.add_button("play", icon=viser.Icon.PLAYER_PLAY)
 
@@ -47,12 +57,7 @@ class MotionPanel:
     """Timeline of one page, with the current frame."""
 
     def __init__(
-        self,
-        client: viser.ClientHandle,
-        session: Session,
-        actor: ViewedActor,
-        playback: Playback,
-        changed: Callable[[], None],
+        self, client: Client, session: Session, actor: ViewedActor, playback: Playback, changed: Callback
     ) -> None:
         """Add the widgets to the current container; call `changed` after every change of pose or keys."""
         self._client, self._session, self._actor, self._changed = client, session, actor, changed
@@ -255,12 +260,7 @@ class FilePanel:
     """Widgets that load and save files."""
 
     def __init__(
-        self,
-        client: viser.ClientHandle,
-        session: Session,
-        actor: ViewedActor,
-        motion: MotionPanel,
-        changed: Callable[[], None],
+        self, client: Client, session: Session, actor: ViewedActor, motion: MotionPanel, changed: Callback
     ) -> None:
         """Add the widgets to the current container; call `changed` after keys have been loaded."""
         self._client, self._session, self._actor = client, session, actor

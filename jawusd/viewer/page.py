@@ -8,7 +8,6 @@ from typing import Literal
 
 import numpy as np
 import viser
-from numpy.typing import NDArray
 
 from jawusd.evaluator import JawRig
 from jawusd.geometry.se3 import transform_point
@@ -18,12 +17,12 @@ from jawusd.viewer.pose_panel import ContactPanel, PosePanel, verdict_html
 from jawusd.viewer.readouts import landmark_places, rest_places
 from jawusd.viewer.scene import FIRST_VIEW, PHONE, JawScene, set_lens
 from jawusd.viewer.session import Session
-from jawusd.viewer.viewed import ViewedActor, ViewedFootage
-from jawusd.viewer.widgets import assign, begin_panel, errors_shown, guarded, small_text
+from jawusd.viewer.viewed import Image, ViewedActor, ViewedFootage
+from jawusd.viewer.widgets import Client, assign, begin_panel, errors_shown, guarded, small_text
 
 #: Entry of the menu with which no footage is shown.
 OFF = "off"
-_EMPTY: NDArray[np.uint8] = np.full((3, 4, 3), 255, np.uint8)
+_EMPTY: Image = np.full((3, 4, 3), 255, np.uint8)
 
 
 class TakeFootagePanel:
@@ -33,7 +32,7 @@ class TakeFootagePanel:
     the camera and frame of the displayed image.
     """
 
-    def __init__(self, client: viser.ClientHandle, footage: ViewedFootage) -> None:
+    def __init__(self, client: Client, footage: ViewedFootage) -> None:
         """Add the widgets to the current container; phones start without footage."""
         self._client, self._footage = client, footage
         self._loop = asyncio.get_running_loop()
@@ -109,7 +108,7 @@ class StaticPlots:
 class PlotPanel:
     """The plots of one page, with the current pose marked: bounds and Posselt's figures."""
 
-    def __init__(self, client: viser.ClientHandle, rig: JawRig, static: StaticPlots) -> None:
+    def __init__(self, client: Client, rig: JawRig, static: StaticPlots) -> None:
         self._rig, self._static = rig, static
         panel = client.gui.add_panel()
         with panel.add_tab("Bounds and borders"):
@@ -130,7 +129,7 @@ class PlotPanel:
         self._moving.content = f'<div style="padding:0 6px">{"".join(parts)}</div>'
 
 
-def begin_page(client: viser.ClientHandle, actor: ViewedActor) -> JawScene:
+def begin_page(client: Client, actor: ViewedActor) -> JawScene:
     """Draw the jaw; the panels are added later."""
     begin_panel(client, actor.name)
     set_lens(client.camera)
@@ -142,7 +141,7 @@ def begin_page(client: viser.ClientHandle, actor: ViewedActor) -> JawScene:
 class Page:
     """Connect a page's widgets with its session."""
 
-    def __init__(self, client: viser.ClientHandle, scene: JawScene, actor: ViewedActor, static: StaticPlots) -> None:
+    def __init__(self, client: Client, scene: JawScene, actor: ViewedActor, static: StaticPlots) -> None:
         """Add the panels beside the jaw drawn by `begin_page`, and the marks on it."""
         self.client, self.scene = client, scene
         scene.add_marks(actor)

@@ -7,7 +7,6 @@ from collections.abc import Callable
 
 import numpy as np
 import viser
-from numpy.typing import NDArray
 
 from jawusd.base.arrays import Array
 from jawusd.base.errors import JawusdError
@@ -19,7 +18,8 @@ from jawusd.viewer.plots import GREEN, VERMILION
 from jawusd.viewer.readouts import Readout, nearest_captured
 from jawusd.viewer.scene import PRESETS, JawScene
 from jawusd.viewer.session import Session
-from jawusd.viewer.widgets import add_dark_checkbox, assign, guarded, small_text
+from jawusd.viewer.viewed import Callback, Image
+from jawusd.viewer.widgets import Client, add_dark_checkbox, assign, guarded, small_text
 
 STEP_MM = 0.01
 NAMES = ("opening", "laterotrusion", "protrusion")
@@ -52,9 +52,7 @@ _NOTHING = np.full((8, 8, 3), 255, np.uint8)
 class PosePanel:
     """Widgets that pose the jaw; `sliders` set d1, d2 and d3 [mm]."""
 
-    def __init__(
-        self, client: viser.ClientHandle, session: Session, scene: JawScene, changed: Callable[[], None]
-    ) -> None:
+    def __init__(self, client: Client, session: Session, scene: JawScene, changed: Callback) -> None:
         """Add the widgets to the current container; call `changed` after every change."""
         self._client, self._session, self._scene, self._changed = client, session, scene, changed
         gui = client.gui
@@ -200,13 +198,7 @@ def _moved(moved_mm: tuple[float, float, float]) -> str:
 class ContactPanel:
     """Image of both arches with their contacts; it is drawn only while it is switched on."""
 
-    def __init__(
-        self,
-        client: viser.ClientHandle,
-        rig: JawRig,
-        draw: Callable[[Array], NDArray[np.uint8]],
-        changed: Callable[[], None],
-    ) -> None:
+    def __init__(self, client: Client, rig: JawRig, draw: Callable[[Array], Image], changed: Callback) -> None:
         """Add the widgets to the current container; call `changed` when the image is switched on or off."""
         self._rig, self._draw, self._changed = rig, draw, changed
         self._drawn: tuple[float, float, float] | None = None

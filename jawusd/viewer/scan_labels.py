@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from jawusd.base.arrays import Indices, Mask
 from jawusd.formats.mesh import BASE, GUM, TOOTH, Mesh
-from jawusd.viewer.viewed import ViewedCapture
-from jawusd.viewer.widgets import Choice, enable, guarded, notify, small_text
+from jawusd.viewer.viewed import Callback, ViewedCapture
+from jawusd.viewer.widgets import Choice, Client, enable, guarded, notify, small_text
 
 #: Label painted by each button.
 BRUSHES = {"crown": TOOTH, "gum": GUM, "base": BASE}
@@ -87,11 +87,7 @@ class ScanLabelsPanel:
     """Widgets that control the brush; a click paints `label`."""
 
     def __init__(
-        self,
-        client: viser.ClientHandle,
-        capture: ViewedCapture,
-        turned: Callable[[], None],
-        painted: Callable[[str], None],
+        self, client: Client, capture: ViewedCapture, turned: Callback, painted: Callable[[str], None]
     ) -> None:
         """Add the widgets; call `turned` when painting is switched on or off, and `painted` to redraw an arch."""
         self._client, self._capture, self._turned, self._painted = client, capture, turned, painted

@@ -14,6 +14,7 @@ from jawusd.geometry.se3 import se3_inverse, transform_point, transform_points
 from jawusd.geometry.so3 import wxyz_from_matrix
 from jawusd.viewer.readouts import CONDYLES, GHOSTS, INCISOR, habitual_path, landmark_places, rest_places
 from jawusd.viewer.viewed import MOVING, STILL, ViewedActor, is_solid
+from jawusd.viewer.widgets import Client
 
 Color = tuple[int, int, int]
 
@@ -94,7 +95,7 @@ def set_pose(frame: viser.FrameHandle, T: Array) -> None:
 class JawScene:
     """3-D scene of one page: first only skull and jaw, then `add_marks`; `grips` are the meshes that can be dragged."""
 
-    def __init__(self, client: viser.ClientHandle, actor: ViewedActor) -> None:
+    def __init__(self, client: Client, actor: ViewedActor) -> None:
         self._client, self._scene = client, client.scene
         self._T_world_skull = np.array(actor.rig.T_anatomical_skull)
         self._rest = rest_places(actor.rig)

@@ -22,7 +22,7 @@ from jawusd.viewer.page import Page, StaticPlots, begin_page
 from jawusd.viewer.readouts import rest_places
 from jawusd.viewer.scene import add_jaw, set_first_view
 from jawusd.viewer.viewed import ViewedActor
-from jawusd.viewer.widgets import set_theme
+from jawusd.viewer.widgets import Client, set_theme
 
 log = logging.getLogger(__name__)
 
@@ -104,7 +104,7 @@ class PageServer(ABC):
                 log.warning("another program has taken that port; open %s instead", self.url)
             first.close()
 
-    async def _connected(self, client: viser.ClientHandle) -> None:
+    async def _connected(self, client: Client) -> None:
         if not self._trusted(client):
             log.warning("refused a page of another site")
             return
@@ -115,15 +115,15 @@ class PageServer(ABC):
             page.close()
 
     @abstractmethod
-    async def _page(self, client: viser.ClientHandle) -> _Closable:
+    async def _page(self, client: Client) -> _Closable:
         """Build the page of a visitor."""
 
-    async def _disconnected(self, client: viser.ClientHandle) -> None:
+    async def _disconnected(self, client: Client) -> None:
         page = self.pages.pop(client.client_id, None)
         if page is not None:
             page.close()
 
-    def _trusted(self, client: viser.ClientHandle) -> bool:
+    def _trusted(self, client: Client) -> bool:
         """Return whether the page came from this server, since browsers let pages of any site connect to localhost."""
         request = self._server._websock_server._live_connections[client.client_id].request
         if request is None:
@@ -182,7 +182,7 @@ class Viewer(PageServer):
                 page.session.show(d)
                 page.refresh()
 
-    async def _page(self, client: viser.ClientHandle) -> Page:
+    async def _page(self, client: Client) -> Page:
         await asyncio.shield(asyncio.wrap_future(self._loaded))
         scene = begin_page(client, self._actor)
         await asyncio.to_thread(wait_until_drawn, client)
@@ -193,7 +193,7 @@ class Viewer(PageServer):
         return page
 
 
-def wait_until_drawn(client: viser.ClientHandle) -> None:
+def wait_until_drawn(client: Client) -> None:
     """Wait until a page has drawn what it was sent, has been closed, or has not answered in time."""
     with contextlib.suppress(TimeoutError, RuntimeError):  # a page without local storage answers with an error
         for _ in range(_ANSWERS):

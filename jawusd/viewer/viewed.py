@@ -26,6 +26,12 @@ if TYPE_CHECKING:  # pages of rigs need no captures, which take a tenth of a sec
 #: Names of the fixed meshes (skull frame) and of the moving meshes (mandible frame).
 STILL, MOVING = ("skull", "upper_teeth", "upper_gum"), ("mandible", "lower_teeth", "lower_gum")
 
+#: What a panel calls after a change.
+Callback = Callable[[], None]
+#: An image, RGB (h, w, 3).
+Image = NDArray[np.uint8]
+#: T_world_upper and T_world_lower of a frame, shape (4, 4) each.
+Poses = tuple[Array, Array]
 Look = Literal["outlines", "tinted", "footage"]
 #: A region of an image: left, top, right, bottom [px].
 Region = tuple[float, float, float, float]
@@ -40,7 +46,7 @@ class ViewedFootage:
     frames: tuple[int, int]  # first and last frame (inclusive) of the take
     # maps (camera, frame of the reference camera) to an image cropped to the teeth, RGB (h, w, 3) uint8; any thread may
     # call it; raises a JawusdError
-    picture: Callable[[str, int], NDArray[np.uint8]]
+    picture: Callable[[str, int], Image]
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +68,7 @@ class ViewedActor:
     save_layer: Callable[[str, Clip, bool], Path]
     # maps d (3,) [mm] to an image of both arches with their contacts, RGB (h, w, 3); raises a JawusdError; None if the
     # rig has no occlusion
-    contacts: Callable[[Array], NDArray[np.uint8]] | None = None
+    contacts: Callable[[Array], Image] | None = None
     verdict: str = ""  # sentence on the build of the rig; "" if there is none
     footage: ViewedFootage | None = None  # None if the capture is not available
 
@@ -85,7 +91,7 @@ class ViewedCapture:
     T_anatomical_skull: Array  # scan frame to anatomical frame, shape (4, 4)
     tracks: Tracks | None  # tracked poses, if any
     # fits poses (4, 4) to picks, and returns them with the names of inconsistent picks; raises a JawusdError
-    poses_of_picks: Callable[[Bootstrap], tuple[tuple[Array, Array], list[str]]]
+    poses_of_picks: Callable[[Bootstrap], tuple[Poses, list[str]]]
     # writes the new picks (first argument) to the capture file if it still has the expected old picks (second
     # argument); otherwise raises a JawusdError
     save_picks: Callable[[Bootstrap, Bootstrap | None], None]
@@ -107,7 +113,7 @@ class ViewedCapture:
         """Return GUM, TOOTH, BOUNDARY or BASE of every vertex by arch, shape (V,)."""
         return {arch: tooth_labels(mesh) if mesh.labels is None else mesh.labels for arch, mesh in self.scans.items()}
 
-    def picture(self, name: str, frame: int, poses: tuple[Array, Array] | None, look: Look) -> NDArray[np.uint8]:
+    def picture(self, name: str, frame: int, poses: Poses | None, look: Look) -> Image:
         """Return a camera's image at a frame of the reference camera, RGB (h, w, 3), with the teeth drawn over it.
 
         It is gray if the camera has no image of that frame; raises a JawusdError.
@@ -123,17 +129,11 @@ class ViewedCapture:
             return image
         return draw_overlay(image, self.cameras[name], placed, fill=_FILL[look])
 
-    def wall(
-        self,
-        frame: int,
-        poses: tuple[Array, Array] | None,
-        look: Look,
-        partly: Callable[[NDArray[np.uint8]], None] | None = None,
-    ) -> NDArray[np.uint8]:
+    def wall(self, frame: int, poses: Poses | None, look: Look, partly: Callable[[Image], None] | None = None) -> Image:
         """Return all cameras' images side by side, as `picture` does; `partly` as in `CameraWall.draw`."""
         return self.all_cameras.draw(frame, self._placed(frame, poses, look), fill=_FILL.get(look, 0.0), partly=partly)
 
-    def _placed(self, frame: int, poses: tuple[Array, Array] | None, look: Look) -> list[PlacedScan]:
+    def _placed(self, frame: int, poses: Poses | None, look: Look) -> list[PlacedScan]:
         from jawusd.media.overlay import LOWER_COLOUR, UPPER_COLOUR, PlacedScan, arch_colours
 
         if poses is None or look == "footage":
@@ -161,7 +161,7 @@ class ViewedCapture:
         low, high = np.percentile(np.vstack(seen), (_SPECKS_PERCENT, 100 - _SPECKS_PERCENT), axis=0)
         return float(low[0]), float(low[1]), float(high[0]), float(high[1])
 
-    def tracked_poses(self, frame: int) -> tuple[Array, Array] | None:
+    def tracked_poses(self, frame: int) -> Poses | None:
         """Return T_world_upper and T_world_lower of a frame, NaN where lost; None if the frame was not tracked."""
         row = None if self.tracks is None else self.tracks.row_of(frame)
         if self.tracks is None or row is None:

@@ -19,6 +19,7 @@ log = logging.getLogger(__name__)
 
 Event = TypeVar("Event")
 Value = TypeVar("Value")
+Client = viser.ClientHandle
 #: Event of a button group.
 Choice = viser.GuiEvent[viser.GuiButtonGroupHandle]
 MOST_BYTES = 8 << 20
@@ -40,14 +41,14 @@ _STYLE = """<style onload="document.title={title}">
 </style><span class="jawusd-page"></span>"""
 
 
-def begin_panel(client: viser.ClientHandle, name: str) -> None:
+def begin_panel(client: Client, name: str) -> None:
     """Set theme and title of a page, and let its panel fill the width of a phone."""
     set_theme(client.gui)
     client.gui.set_panel_label(name)
     client.gui.add_html(_STYLE.format(title=html.escape(json.dumps(f"{name} - jawusd"))))
 
 
-def add_dark_checkbox(client: viser.ClientHandle) -> None:
+def add_dark_checkbox(client: Client) -> None:
     """Add the checkbox for dark mode, which is checked by default."""
     box = client.gui.add_checkbox("dark page", True)
 
@@ -77,13 +78,13 @@ def small_text(html: str, style: str = "") -> str:
     return f'<div style="font-size:12px;padding:2px 12px;{style}">{html}</div>'
 
 
-def notify(client: viser.ClientHandle, title: str, body: str, *, bad: bool = False) -> None:
+def notify(client: Client, title: str, body: str, *, bad: bool = False) -> None:
     """Show a message in a page; failures (`bad`) stay until they are closed."""
     client.add_notification(title, body, color="red" if bad else "teal", auto_close_seconds=None if bad else 5.0)
 
 
 @contextlib.contextmanager
-def errors_shown(client: viser.ClientHandle) -> Iterator[None]:
+def errors_shown(client: Client) -> Iterator[None]:
     """Show errors in the page instead of raising them, so that they do not stop the server."""
     try:
         yield
@@ -95,7 +96,7 @@ def errors_shown(client: viser.ClientHandle) -> Iterator[None]:
 
 
 def guarded(
-    client: viser.ClientHandle, action: Callable[[Event], Coroutine[object, None, None] | None]
+    client: Client, action: Callable[[Event], Coroutine[object, None, None] | None]
 ) -> Callable[[Event], Coroutine[object, None, None]]:
     """Make a callback in the event loop of a function or coroutine for a visitor's events; show its errors in the page.
 
@@ -122,7 +123,7 @@ def upload_name(upload: viser.UploadedFile, suffixes: tuple[str, ...]) -> tuple[
     return shown, suffix
 
 
-def limit_uploads(client: viser.ClientHandle, button: viser.GuiUploadButtonHandle | None) -> None:
+def limit_uploads(client: Client, button: viser.GuiUploadButtonHandle | None) -> None:
     """Abort uploads that are larger than `MOST_BYTES`, concurrent, or not meant for the page's button.
 
     viser buffers the parts of an upload without a limit, for any widget that the message names. Its own handlers run
