@@ -229,7 +229,7 @@ def write_page(path: AnyPath | None, out: Path, prim: str | None = None, *, foot
     Raises CaptureError if there is no footage, RigError if contacts cannot be computed, and OutputError.
     """
     from jawusd.formats.report import ReplayPart
-    from jawusd.report.pose_page import PosePage, write_pose_page
+    from jawusd.report.jaw_pages import PosePage, write_pose_page
     from jawusd.rig.read import describe
     from jawusd.rig.table import DEFAULT_SIZE, grid_axes, valid_box
     from jawusd.viewer.readouts import GHOSTS, GHOSTS_APART_MM

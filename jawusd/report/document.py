@@ -17,7 +17,7 @@ from jawusd.formats.notes import TracksMeta, registration_sizes
 from jawusd.formats.report import BuildVerdict, ReportData, verdict_sentence
 from jawusd.formats.tracks import LOST, LostReason
 from jawusd.report.figures import human_ranges, model_figure, tracking_figure
-from jawusd.report.replay import replay_data
+from jawusd.report.jaw_pages import replay_data
 from jawusd.report.style import inline_svg
 from jawusd.report.templates import rendered
 from jawusd.report.verdicts import MARKS, WORDS, judge, summary

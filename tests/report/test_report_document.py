@@ -17,7 +17,7 @@ from jawusd.formats.finding import Finding
 from jawusd.formats.report import Origin, Overlay, RigFacts
 from jawusd.formats.tracks import LostReason
 from jawusd.report.document import _frame_lists
-from jawusd.report.replay import replay_data
+from jawusd.report.jaw_pages import replay_data
 from jawusd.report.templates import worded
 
 SECTIONS = (

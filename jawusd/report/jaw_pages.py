@@ -1,14 +1,14 @@
-"""Write a web page that poses and keys a rig without a server: meshes, sampled decoder and bound in one HTML file."""
+"""Jaws in 3-D pages: the replay of a report, and the page that poses and keys a rig without a server."""
 
 from __future__ import annotations
 
 import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from jawusd.base.arrays import Array
 from jawusd.base.errors import AnyPath
@@ -16,15 +16,105 @@ from jawusd.evaluator import JawRig
 from jawusd.evaluator.contact import AUTHORED_MM, UNIT_MM, ContactField
 from jawusd.evaluator.motions import motions_of_poses
 from jawusd.formats.atomic import write_text_atomic
+from jawusd.formats.keys import DEFAULT_FPS
 from jawusd.formats.mesh import DEEP, TOUCHING
-from jawusd.formats.report import ReplayPart
+from jawusd.formats.report import ReplayPart, ReportData
+from jawusd.formats.tracks import LOST, PARTIAL, RECOVERED, Tracks
 from jawusd.geometry.se3 import se3_log, transform_points
-from jawusd.report.replay import TRACED, encoded, framed, packed
 from jawusd.report.templates import base64_text, rendered
 
 if TYPE_CHECKING:
     from jawusd.meshes.contact import Teeth
     from jawusd.meshes.solid import DistanceGrid
+
+#: Names of the tracking states of frames.
+STATES = ("tracked", "recovered after a loss", "tracked without a camera", "lost", "regularised by the model")
+#: Landmarks whose paths are drawn: the lower incisal point and both condyles.
+TRACED = (0, 3, 4)
+_MOST_FRAMES = 6000  # maximum number of frames; longer takes are subsampled
+
+
+def replay_data(data: ReportData) -> dict[str, object] | None:
+    """Return the input of replay.js, ready for JSON encoding; None without meshes or frames.
+
+    Poses are motions relative to occlusion in the anatomical frame, as row-major 3 x 4 matrices. Mesh
+    vertices are quantised to 16 bits over the bounding box.
+    """
+    tracks, model = data.tracks, data.model
+    if not data.parts or not len(tracks.frames):
+        return None
+    step = -(-len(tracks.frames) // _MOST_FRAMES)
+    rows = np.arange(0, len(tracks.frames), step)
+    d = _parameters_at(tracks.frames[rows], data)
+    fitted = np.full((len(rows), 4, 4), np.nan)
+    known = np.all(np.isfinite(d), axis=1)
+    rig, margin = JawRig(model.arrays, model.meta), np.full(len(rows), np.nan)
+    fitted[known], margin[known] = rig.pose(d[known]), rig.margin(d[known])
+    A, rest = rig.T_anatomical_skull, rig.T_rest
+    return {
+        **_scene(rig, data.parts),
+        "captured": _poses(motions_of_poses(tracks.T_upper_lower[rows], A, rest)),
+        "fitted": _poses(motions_of_poses(fitted, A, rest)),
+        "d": encoded(d.astype("<f4")),
+        "margin": encoded(margin.astype("<f4")),
+        "frames": encoded(tracks.frames[rows].astype("<i4")),
+        "state": encoded(_states(tracks)[rows]),
+        "states": list(STATES),
+        "fps": float(data.model.notes.get("fps") or DEFAULT_FPS) / step,
+    }
+
+
+def _parameters_at(frames: NDArray[np.int64], data: ReportData) -> Array:
+    """Return the jaw parameters of frames [mm], shape (F, 3); NaN where the model has no parameters."""
+    rows = {int(frame): row for row, frame in enumerate(data.model.frames)}
+    missing = np.full(3, np.nan)
+    return np.array([data.model.d[rows[int(f)]] if int(f) in rows else missing for f in frames])
+
+
+def _states(tracks: Tracks) -> NDArray[np.uint8]:
+    state = np.zeros(len(tracks.frames), np.uint8)
+    for value, code in ((RECOVERED, 1), (PARTIAL, 2), (LOST, 3)):
+        state[np.any(tracks.status == value, axis=1)] = code
+    state[tracks.prior_aided & (state != 3)] = 4
+    return state
+
+
+def _poses(motion: Array) -> str:
+    return encoded(motion[:, :3].reshape(len(motion), 12).astype("<f4"))
+
+
+def packed(part: ReplayPart) -> dict[str, object]:
+    """Return a mesh for scene.js, its vertices quantised to 16 bits over the bounding box.
+
+    Raises ValueError if the mesh has more vertices than 16 bits can number.
+    """
+    mesh = part.mesh
+    if len(mesh.vertices) > np.iinfo(np.uint16).max:
+        raise ValueError(f"a mesh of the replay has {len(mesh.vertices)} vertices; the limit is 65535")
+    low = mesh.vertices.min(0)
+    step = float(np.ptp(mesh.vertices, axis=0).max()) / np.iinfo(np.uint16).max or 1.0
+    vertices = np.round((mesh.vertices - low) / step).astype("<u2")
+    arrays = {"vertices": encoded(vertices), "faces": encoded(mesh.faces.astype("<u2"))}
+    return {"name": part.name, "kind": part.kind, "moves": part.moves, "low": low.tolist(), "step": step, **arrays}
+
+
+def encoded(values: ArrayLike) -> str:
+    """Return the bytes of an array as base64 text."""
+    return base64_text(np.ascontiguousarray(values).tobytes())
+
+
+def _scene(rig: JawRig, parts: Sequence[ReplayPart]) -> dict[str, object]:
+    """Return what both pages show: meshes, tolerance and traced landmarks [mm], and where the camera is aimed."""
+    landmarks = transform_points(rig.T_anatomical_skull @ rig.T_rest, rig.landmarks)
+    jaw = [part.mesh.vertices for part in parts if part.name != "skull"] or [parts[0].mesh.vertices]
+    low, high = np.concatenate(jaw).min(0), np.concatenate(jaw).max(0)
+    return {
+        "parts": [packed(part) for part in parts],
+        "tolerance": rig.tolerance_mm,
+        "traced": landmarks[list(TRACED)].round(3).tolist(),
+        "centre": (0.5 * (low + high)).round(2).tolist(),
+        "radius": round(float(np.linalg.norm(high - low)) / 2, 2),
+    }
 
 
 _STEP_MM = 0.02  # quantisation step of stored distances
@@ -115,20 +205,16 @@ def pose_data(page: PosePage) -> dict[str, object]:
     rig = page.rig
     d = np.stack(np.meshgrid(*page.axes, indexing="ij"), axis=-1).reshape(-1, 3)
     twists = se3_log(motions_of_poses(rig.pose(d), rig.T_anatomical_skull, rig.T_rest))
-    landmarks = transform_points(rig.T_anatomical_skull @ rig.T_rest, rig.landmarks)
     clearance = rig.contact
     captured = rig.captured_d[:: max(1, -(-len(rig.captured_d) // _MOST_CAPTURED))]
     return {
-        "parts": [packed(part) for part in page.parts],
+        **_scene(rig, page.parts),
         "axes": [axis.round(6).tolist() for axis in page.axes],
         "table": encoded(np.column_stack([twists, rig.margin(d)]).astype("<f4")),
         "take": encoded(np.column_stack([page.take, rig.margin(page.take)]).astype("<f4")),
         "first": page.first,
         "fps": page.fps,
-        "tolerance": rig.tolerance_mm,
-        "traced": landmarks[list(TRACED)].round(3).tolist(),
         "ghosts": {"captured": encoded(captured.astype("<f4")), "count": page.ghosts[0], "apart": page.ghosts[1]},
         "contact": None if clearance is None or page.teeth is None else contact_data(clearance, page.teeth),
         "footage": page.footage,
-        **framed(page.parts),
     }
