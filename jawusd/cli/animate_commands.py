@@ -185,9 +185,7 @@ def read_face(rig: JawRig, source: Path, fps: float | None, mapping: Path | None
 
     Without a mapping, JawOpen = 1 is the full opening, and (JawLeft - JawRight) and JawForward are fractions of the
     ranges of motion at the current opening. Left is the subject's left. Without `fps`, the time codes give the rate.
-
-    Raises:
-        FormatError: the file is invalid or has no row with a face, or the mapping belongs to another subject.
+    Raises FormatError if no row has a face.
     """
     from jawusd.pipeline.skin import load_own_skin, own_columns
 

@@ -118,10 +118,8 @@ class PersonalMotion:
 def leave_one_out(donors: Sequence[Donor], *, closest: bool = False) -> Learned:
     """Predict every subject of a library from the other subjects, and choose the bandwidth of the weights.
 
-    With `closest`, only the subject with the most similar landmarks is used, instead of an average.
-
-    Raises:
-        FittingError: `donors` is empty.
+    With `closest`, only the subject with the most similar landmarks is used, instead of an average. Raises FittingError
+    without any subject.
     """
     if not donors:
         raise FittingError("the library has no subject whose motion can be transferred.")

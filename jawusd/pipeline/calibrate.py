@@ -32,8 +32,7 @@ def calibrate_boards(capture: Capture, out: Path, progress: Progress) -> Calibra
     """Calibrate the cameras from the boards of a capture and write the calibration as aniposelib TOML.
 
     Raises:
-        CalibrationError: the boards do not suffice for a calibration.
-        CaptureError: a clip or scan cannot be read.
+        CalibrationError, CaptureError: the boards do not suffice, or a clip or scan cannot be read.
         OutputError: the file cannot be written.
     """
     from jawusd.capture.calibrate import calibrate_capture

@@ -68,8 +68,7 @@ def convert_cameras(source: Path, out: Path, unit_mm: float, size: Size | None) 
         size: (width, height) [px] of the images, for formats that do not state it.
 
     Raises:
-        CalibrationError, FormatError, RigError: the source contains no valid cameras, or the output format cannot
-            represent them.
+        CalibrationError, FormatError, RigError: the source has no valid cameras, or the output cannot represent them.
         OutputError: the file cannot be written, or has an unsupported suffix.
     """
     cameras = read_calibration(source, unit_mm, lambda: {} if size is None else SameSize(size))

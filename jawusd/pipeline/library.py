@@ -204,12 +204,8 @@ def retarget(source: JawRig, target: JawRig, frames: Array, d: Array) -> Retarge
     ranges of motion. Equal fractions alone would shift peaks by some frames and might leave the bound, so the motion is
     alternately adjusted to rise and fall with the source (see `library.timing`) and projected into the bound.
 
-    Args:
-        frames: increasing frame numbers, shape (F,).
-        d: jaw parameters of the source [mm], NaN in lost frames, shape (F, 3).
-
-    Raises:
-        EvaluatorError: no frame has parameters.
+    `frames` (F,) increase; `d` (F, 3) are parameters of the source [mm], NaN in lost frames. Raises EvaluatorError if
+    no frame has parameters.
     """
     known = np.isfinite(d).all(axis=1)
     if not known.any():

@@ -76,14 +76,11 @@ _POLL_S = 0.005  # time between attempts to read more of a growing file [s]
 
 
 class LiveSkin:
-    """The jaw in live frames, estimated from facial skin.
+    """The jaw in live frames, estimated from facial skin; `face` is played and stopped like the sources of images.
 
     The face data are a recording, in any format of `read_face`, if all cameras are files; its times begin with the
     images. Otherwise, they are a face table (see `formats.face_table`) that is read while it is written: a growing
     file, a pipe or the standard input. Its clock is aligned by the arrival times of the rows.
-
-    Attributes:
-        face: the face data, to be played and stopped like the sources of images.
     """
 
     def __init__(self, rig: JawRig, options: SkinOptions, *, recorded: bool) -> None:

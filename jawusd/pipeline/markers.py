@@ -41,8 +41,7 @@ def marker_poses(
         unit: unit of the rigid bodies, and of tables that do not state a unit; a key of `LENGTH_UNITS_MM`.
 
     Raises:
-        FormatError: a rigid body is unknown, missing or does not fit the markers; the rest frame is missing or lacks a
-            marker.
+        FormatError: a rigid body does not fit the markers, or the rest frame lacks one of them.
     """
     path = Path(path)
     with naming_file(path):
@@ -75,10 +74,7 @@ def in_head(
 def read_c3d(path: AnyPath) -> MarkerTable:
     """Read the points of a C3D file; points with a negative residual are occluded (https://www.c3d.org).
 
-    Raises:
-        FormatError: the file is not C3D.
-        UnitsError: the file's unit is not a unit of length.
-        MissingDependencyError: ezc3d is not installed.
+    Raises FormatError if the file is not C3D, UnitsError if its unit is not one of length, and MissingDependencyError.
     """
     import ezc3d
 

@@ -84,10 +84,8 @@ def worst_and_usual(
 ) -> list[tuple[int, str]]:
     """Return frames with the largest values, and one with the median value, each as its row and the reason in words.
 
-    Args:
-        worst: values (F,) of every frame, NaN if unknown; the largest number of frames; and the words for one, with a
-            placeholder for its value.
-        usual: values (F,), and the words for the frame with the median one.
+    `worst` are values (F,) of every frame, NaN if unknown, the largest number of frames, and the words for one, with a
+    placeholder for its value; `usual` are values (F,) and the words for the frame with the median one.
     """
     found: list[tuple[int, str]] = []
     for values, count, words in worst:

@@ -281,14 +281,9 @@ def camera_facts(capture: Capture) -> tuple[CameraFacts, ...]:
 def run_paper_experiments(
     subject: Subject, motion: Tracks | Poses, starts: int, progress: Progress, *, quick: bool = False
 ) -> Experiments:
-    """Run the paper's experiments.
+    """Run the paper's experiments, with some random `starts` of its networks; raises FittingError for too few poses.
 
-    Args:
-        starts: number of random starts of the paper's networks.
-        quick: skip the networks and the paper's model, which take minutes.
-
-    Raises:
-        FittingError: the poses do not suffice for a model.
+    With `quick`, the networks and the paper's model, which take minutes, are skipped.
     """
     from jawusd.fitting import FittingConfig
     from jawusd.fitting.data import SubjectAnatomy

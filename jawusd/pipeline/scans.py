@@ -54,9 +54,7 @@ def label_scans(
     allow_outside: bool = False,
     progress: Progress = no_progress,
 ) -> ScansSummary:
-    """Label both teeth scans of a capture, store labels found by shape, and draw an image of the labels.
-
-    Paint and existing labels are kept.
+    """Label both teeth scans of a capture by shape unless they have paint or labels, store these, and draw an image.
 
     Args:
         out: folder of labels and image; None: labels are written to the labels folder of the capture or beside the
@@ -90,11 +88,7 @@ def all_labelled(capture: Capture) -> bool:
 def store_labels(capture: Capture, folder: Path) -> list[Path]:
     """Write the labels of both teeth scans to a folder if either is labelled by shape; return the files written.
 
-    Labels written by an earlier call are deleted.
-
-    Raises:
-        FormatError, CaptureError: a scan or its labels cannot be read.
-        OutputError: a file cannot be written.
+    Labels written by an earlier call are deleted. Raises like `labelled_teeth`, and OutputError.
     """
     scans = labelled_teeth(capture, capture.scans.labels)
     written = []

@@ -53,8 +53,7 @@ def segment_teeth(
     The files are CAMERA/upper/000123.png, numbered by the camera's own frames. Returns the record of all frames.
 
     Raises:
-        CaptureError: fewer than two cameras have a video, or one cannot be decoded.
-        TrackingError: the teeth are not found at the picks or, without picks, in the footage.
+        CaptureError, TrackingError: fewer than two cameras have a video, or the teeth are not found.
         OutputError: a file cannot be written.
     """
     with ThreadPoolExecutor(options.jobs) as pool:

@@ -73,10 +73,7 @@ def read_jaw(rig: JawRig, path: AnyPath) -> JawTake:
     """Read the jaw motion of a take from tracks.npz, the CSV of a solved performance, or a table of d or poses.
 
     In tracks, frames count as seen if both arches were tracked without a prior; in a performance, if they are solved;
-    in a table, always.
-
-    Raises:
-        FormatError: the file is none of these.
+    in a table, always. Raises FormatError if the file is none of these.
     """
     path = Path(path)
     if path.suffix == ".npz":
@@ -130,12 +127,8 @@ def load_own_skin(rig: JawRig, path: AnyPath) -> Skin:
 def own_columns(skin: Skin, map_path: AnyPath, face: FaceTable, path: AnyPath) -> Array:
     """Return the columns (F, K) or points (F, N, 3) from which a map was learned, found in face data by name.
 
-    Args:
-        face: face data, which may have more columns or points than the map.
-        map_path, path: files of the map and of the face data, for messages.
-
-    Raises:
-        FormatError: a column or point is missing, or the data have points and the map columns, or conversely.
+    The data may have more columns or points; the files of both are named in messages. Raises FormatError if a column or
+    point is missing, or if the data have points and the map columns, or conversely.
     """
     place = {name.lower(): k for k, name in enumerate(face.names)}
     names = [name.lower() for name in skin.names or face.names]
@@ -217,15 +210,12 @@ def learn_skin(
     *,
     jaw_weights: bool = False,
 ) -> tuple[Skin, float]:
-    """Learn to estimate d from facial motion; see `fitting.skin.fit_skin` and `fitting.skin.clock_offset`.
+    """Return a map from facial motion to d and the offset of the clocks [s], learned from one performance.
 
     Args:
-        jaw, face: recordings of one performance, with frame rates.
+        jaw, face: recordings of the performance, with frame rates.
         offset_s: seconds to add to times of `face` to obtain times of `jaw`; default: estimated.
         jaw_weights: whether the face has only the four ARKit jaw weights, which are then checked to suffice.
-
-    Returns:
-        The map from face to d, and the offset [s].
 
     Raises:
         FittingError: see `fitting.skin.clock_offset`, `fitting.skin.fit_skin` and `fitting.face.check_jaw_weights`.

@@ -191,9 +191,7 @@ def write_solved(
 ) -> None:
     """Write a performance to a file whose suffix selects the format; see `solve`.
 
-    Raises:
-        OutputError: the file cannot be written.
-        RigError: an animation layer of the rig cannot be written.
+    Raises OutputError, and RigError if an animation layer of the rig cannot be written.
     """
     suffix = Path(out).suffix.lower()
     if suffix == ".csv":
@@ -216,8 +214,7 @@ def check_output(
     """Check, before any work, the suffixes of the output files: performance, overlay and report.
 
     Raises:
-        OutputError: a suffix is not supported.
-        RigError: an animation layer needs a USD rig.
+        OutputError, RigError: a suffix is not supported, or an animation layer lacks a USD rig.
         MissingDependencyError: packages that the report needs are not installed.
     """
     if report is not None:

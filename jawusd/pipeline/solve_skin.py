@@ -34,9 +34,8 @@ _COMPARED, _FIRST_PASS_MM, _MOST_APART = 20, 0.5, 4.0
 class SkinOfShot:
     """Jaw parameters of a shot, estimated from facial skin; a function object for the solver.
 
-    Attributes:
-        offset_s: seconds from frame 0 of the shot to frame 0 of the face data; None until it is estimated.
-        unfamiliar: frames of the last call in which the face does not resemble those from which the map was learned.
+    `offset_s` are the seconds from frame 0 of the shot to frame 0 of the face data, None until it is estimated;
+    `unfamiliar` are the frames of the last call in which the face is unlike those from which the map was learned.
     """
 
     def __init__(self, rig: JawRig, options: SkinOptions, fps: float) -> None:
@@ -106,9 +105,7 @@ def check_agreement(face: AnyPath, found: SkinJaw, d: Array) -> None:
 class SkinOfFootage:
     """Jaw parameters of a shot, estimated from points on the skin in its footage; a function object for the solver.
 
-    Attributes:
-        learned: the jaw of the last call, and what it was learned from; None before.
-        points: number of points that it was learned from.
+    `learned` is the jaw of the last call, None before, and `points` the number of points that it was learned from.
     """
 
     def __init__(

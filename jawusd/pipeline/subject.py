@@ -226,11 +226,8 @@ def subject_of_capture(capture: Capture, meshes: Mapping[str, Mesh] | None = Non
 def subject_of_scans(files: Mapping[str, Path], name: str) -> Subject:
     """Return the subject of mesh files that share one coordinate frame, with the teeth in occlusion.
 
-    Args:
-        files: mesh files by the names in `MESHES`; both teeth scans are required.
-
-    Raises:
-        CaptureError: a mesh is corrupt or not in mm, or the scans are swapped or not in occlusion.
+    The files are named as in `MESHES`; both teeth scans are required. Raises CaptureError if a mesh is corrupt or not
+    in mm, or if the scans are swapped or not in occlusion.
     """
     return _measured(name, _read_labelled(files, None)[0], None, None, {})
 

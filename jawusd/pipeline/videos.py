@@ -77,11 +77,7 @@ STAGE = "follow"
 
 
 class Follower:
-    """Tracker of both arches from a start frame to both ends of a take.
-
-    Attributes:
-        sampled_views: poses and views of evenly sampled frames of the last run.
-    """
+    """Tracker of both arches from a start frame; `sampled_views` has poses and views of some frames of the last run."""
 
     def __init__(
         self,
@@ -207,11 +203,9 @@ class VideoOptions:
 
 
 class PreparedTeeth:
-    """The scans of a subject, prepared for tracking.
+    """The scans of a subject, prepared for tracking; `search` finds the teeth in rough masks.
 
-    Attributes:
-        axes: rotation from scan to anatomical axes (left, up, front), shape (3, 3).
-        search: finds the teeth in rough masks.
+    `axes` is the rotation from scan to anatomical axes (left, up, front), shape (3, 3).
     """
 
     def __init__(self, capture: Capture, meshes: Mapping[str, Mesh], jaw: JawRig, map_: Mapper) -> None:

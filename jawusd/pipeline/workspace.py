@@ -109,11 +109,9 @@ class StageMissing(Exception):
 
 
 class Workspace:
-    """Runs the stages of a build and records them; stages whose inputs have not changed are reused.
+    """Runs the stages of a build and records them; stages whose inputs have not changed are `reused`.
 
-    Attributes:
-        capture: the capture, with the scan labels and the calibration from earlier stages.
-        reused: names of the stages that were reused.
+    `capture` has the scan labels and the calibration from earlier stages.
     """
 
     def __init__(
@@ -163,8 +161,7 @@ class Workspace:
         Args:
             parts: parts of the capture that the stage reads, by the names of `input_files`.
             settings: everything else that determines the result, such as options and the results of earlier stages.
-            work: function that runs the stage; returns the files written, inside the folder, and the result for
-                build.json.
+            work: runs the stage; returns the files written, inside the folder, and the result for build.json.
 
         Raises:
             CaptureError: an input changed while the stage ran; the stage is not recorded.

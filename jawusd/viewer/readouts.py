@@ -19,22 +19,14 @@ GHOSTS, GHOSTS_APART_MM = 3, 1.0
 
 @dataclass(frozen=True)
 class Readout:
-    """The displayed measures of one pose.
-
-    Attributes:
-        incisor_mm, condyle_left_mm, condyle_right_mm: displacement of the incisal point and of the condyle centres to
-            the subject's left, up and forward.
-        margin_mm: signed distance to the bound, > 0 inside.
-        captured_mm: distance in d to the nearest captured pose; infinite if there are none.
-        inside: whether d lies inside the bound.
-    """
+    """The displayed measures of one pose; displacements are to the subject's left, up and forward [mm]."""
 
     incisor_mm: tuple[float, float, float]
     condyle_left_mm: tuple[float, float, float]
     condyle_right_mm: tuple[float, float, float]
-    margin_mm: float
-    captured_mm: float
-    inside: bool
+    margin_mm: float  # signed distance to the bound, > 0 inside
+    captured_mm: float  # distance in d to the nearest captured pose; infinite if there are none
+    inside: bool  # whether d lies inside the bound
 
 
 def landmark_places(rig: JawRig, d: Array) -> Array:
