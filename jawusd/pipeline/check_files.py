@@ -6,7 +6,7 @@ import filecmp
 from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import combinations
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -86,11 +86,10 @@ class Parts:
         return guesses
 
 
-def found_error(kind: str, error: JawusdError) -> Finding:
-    """Convert an exception to a finding."""
-    return Finding(
-        kind, "error", error.message, path=error.path, camera=error.camera, frame=error.frame, hint=error.hint
-    )
+def found_error(kind: str, error: JawusdError, camera: str | None = None) -> Finding:
+    """Convert an exception to a finding, about a camera if given."""
+    path, camera = error.path, camera or error.camera
+    return Finding(kind, "error", error.message, path=path, camera=camera, frame=error.frame, hint=error.hint)
 
 
 # Maximum median distance of crown vertices from their bone [mm]; larger distances indicate different coordinate frames.
@@ -141,27 +140,19 @@ def bone_findings(parts: Parts) -> Iterator[Finding]:
         vertices = parts.meshes[bone].vertices
         apart = np.median([np.linalg.norm(vertices - point, axis=1).min() for point in scan.crown_vertices(300)])
         if apart > _TEETH_TO_BONE_MM:
-            yield Finding(
-                "bone_elsewhere",
-                "warning",
-                f"the {bone} is {apart:.0f} mm from the {arch} teeth; at most {_TEETH_TO_BONE_MM:g} mm is plausible",
-                float(apart),
-                _TEETH_TO_BONE_MM,
-                path=str(getattr(parts.given.scans, bone)),
-                hint="Export it in the coordinate frame of the scans, in mm.",
+            message = (
+                f"the {bone} is {apart:.0f} mm from the {arch} teeth; at most {_TEETH_TO_BONE_MM:g} mm is plausible"
             )
+            path, hint = getattr(parts.given.scans, bone), "Export it in the coordinate frame of the scans, in mm."
+            limit = _TEETH_TO_BONE_MM
+            yield Finding("bone_elsewhere", "warning", message, float(apart), limit, path=str(path), hint=hint)
     landmarks = dict(zip(LANDMARKS, subject_of_capture(parts.given, parts.meshes).landmarks, strict=True))
     width = float(np.linalg.norm(landmarks["condyle_left"] - landmarks["condyle_right"]))
     if not _CONDYLES_MM[0] <= width <= _CONDYLES_MM[1]:
-        yield Finding(
-            "condyles",
-            "warning",
-            f"the condyles are {width:.0f} mm apart; {_CONDYLES_MM[0]:g} to {_CONDYLES_MM[1]:g} mm is plausible",
-            width,
-            _CONDYLES_MM[width > _CONDYLES_MM[1]],
-            path=parts.description,
-            hint="Check the mandible mesh, or give the condyles in [anatomy.landmarks].",
-        )
+        message = f"the condyles are {width:.0f} mm apart; {_CONDYLES_MM[0]:g} to {_CONDYLES_MM[1]:g} mm is plausible"
+        limit = _CONDYLES_MM[width > _CONDYLES_MM[1]]
+        hint = "Check the mandible mesh, or give the condyles in [anatomy.landmarks]."
+        yield Finding("condyles", "warning", message, width, limit, path=parts.description, hint=hint)
 
 
 def clips(parts: Parts) -> Iterator[Finding]:
@@ -175,7 +166,7 @@ def clips(parts: Parts) -> Iterator[Finding]:
         try:
             parts.videos[camera.name] = open_clip(camera.clip)
         except JawusdError as error:
-            yield replace(found_error("clip", error), camera=camera.name)
+            yield found_error("clip", error, camera.name)
     with ThreadPoolExecutor() as pool:
         for found in pool.map(lambda item: list(decoded_findings(item[1], item[0])), parts.videos.items()):
             yield from found
@@ -241,17 +232,12 @@ def boards(parts: Parts) -> Iterator[Finding]:
         try:
             video = open_clip(path)
         except JawusdError as error:
-            yield replace(found_error("board_clip", error), camera=camera.name)
+            yield found_error("board_clip", error, camera.name)
             continue
         yield from decoded_findings(video, camera.name)
         own = parts.videos.get(camera.name)
         if own is not None and abs(video.size_px[0] * own.size_px[1] / own.size_px[0] - video.size_px[1]) > 1.0:
-            yield Finding(
-                "board_shape",
-                "error",
-                f"its board clip ({video.size_px[0]} x {video.size_px[1]} px) and its video ({own.size_px[0]} x "
-                f"{own.size_px[1]} px) have different aspect ratios",
-                path=str(path),
-                camera=camera.name,
-                hint="Record the boards in the recording mode of the take.",
-            )
+            message = f"its board clip ({video.size_px[0]} x {video.size_px[1]} px) and its video ({own.size_px[0]} x "
+            message += f"{own.size_px[1]} px) have different aspect ratios"
+            hint = "Record the boards in the recording mode of the take."
+            yield Finding("board_shape", "error", message, path=str(path), camera=camera.name, hint=hint)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -47,7 +46,7 @@ def masks(parts: Parts) -> Iterator[Finding]:
             sample = MaskSamples(source, size, parts.open_files)
         except JawusdError as error:
             missing = True
-            yield replace(found_error("masks", error), camera=source.name)
+            yield found_error("masks", error, source.name)
             continue
         if sample.first_frame is not None:
             parts.samples[source.name] = sample
@@ -62,13 +61,9 @@ def synchronisation(parts: Parts) -> Iterator[Finding]:
     if capture.sync.offsets is None and len(capture.cameras) > 1:
         silent = [camera.name for camera in capture.cameras if camera.video is None]
         if silent:
-            yield Finding(
-                "taken_as_simultaneous",
-                "warning",
-                f"no video for {', '.join(silent)}: the cameras cannot be aligned and are assumed simultaneous",
-                path=parts.description,
-                hint="Give [sync] offsets.",
-            )
+            message = f"no video for {', '.join(silent)}: the cameras cannot be aligned and are assumed simultaneous"
+            hint = "Give [sync] offsets."
+            yield Finding("taken_as_simultaneous", "warning", message, path=parts.description, hint=hint)
 
 
 def frames(parts: Parts) -> Iterator[Finding]:
