@@ -30,12 +30,13 @@ from jawusd.pipeline.state import (
     Progress,
     ReportSummary,
     StageRecord,
+    locked,
     no_progress,
     origin_now,
 )
 from jawusd.pipeline.subject import subject_of_capture
 from jawusd.pipeline.track import TrackSummary, first_pass, model_pass, track_summary
-from jawusd.pipeline.workspace import DryWorkspace, Stage, StageMissing, Workspace, check_folder, open_capture, opened
+from jawusd.pipeline.workspace import DryWorkspace, Stage, StageMissing, Workspace, check_folder, open_capture
 
 OLD_MASKS = "masks"  # folder to which version 0.1 wrote masks if the capture named no mask folder
 
@@ -105,9 +106,12 @@ def build(
     def read() -> Capture:
         return open_capture(capture, allow_outside=options.allow_outside)
 
-    folder = Path(out)
-    with opened(folder, read, resume=options.resume, fresh=options.fresh, progress=progress or no_progress) as run:
+    folder, given = Path(out), read()
+    check_folder(folder, resume=options.resume, fresh=options.fresh)
+    with locked(folder):
+        run = Workspace(folder, given, read, progress or no_progress)
         if options.fresh:
+            run.state.clear()
             delete_masks(folder / OLD_MASKS)
         return run_stages(run, options, tell)
 

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Generic
@@ -26,7 +25,6 @@ from jawusd.pipeline.state import (
     StageRecord,
     hash_files,
     hash_value,
-    locked,
     no_progress,
 )
 from jawusd.pipeline.subject import BONES, TEETH
@@ -203,23 +201,6 @@ class DryWorkspace(Workspace):
 
     def _work(self, stage: Stage[R], inputs: str, work: Callable[[], tuple[list[Path], R]]) -> StageRecord[R]:
         raise StageMissing(stage.name)
-
-
-@contextlib.contextmanager
-def opened(
-    folder: Path, read_capture: Callable[[], Capture], *, resume: bool, fresh: bool, progress: Progress
-) -> Iterator[Workspace]:
-    """Open and lock the folder of a build; `read_capture` is called first, and again after each stage.
-
-    Raises like `check_folder` and `state.locked`.
-    """
-    capture = read_capture()
-    check_folder(folder, resume=resume, fresh=fresh)
-    with locked(folder):
-        workspace = Workspace(folder, capture, read_capture, progress)
-        if fresh:
-            workspace.state.clear()
-        yield workspace
 
 
 def check_folder(folder: Path, *, resume: bool, fresh: bool) -> None:
