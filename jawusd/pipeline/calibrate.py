@@ -147,11 +147,12 @@ def write_sync_plot(path: Path, curves: Mapping[str, LightCurve], result: SyncNo
 
     Raises OutputError, and MissingDependencyError without matplotlib.
     """
-    from jawusd.report.figures import draw_sync
+    from jawusd.report.figures import sync_figure
+    from jawusd.report.style import write_figure
 
     title, offsets = "the cameras could not be aligned", None
     if result is not None:
         offsets = result["offsets"]
         listed = ", ".join(f"{name} {offsets[name]:+d}" for name in curves)
         title = f"aligned ({result['method']}): {listed} frames"
-    draw_sync(curves, offsets, title, path)
+    write_figure(path, sync_figure(curves, offsets, title))

@@ -17,12 +17,11 @@ from jawusd.base.errors import shown
 from jawusd.evaluator import JawRig
 from jawusd.evaluator.motions import motions_of_poses
 from jawusd.evaluator.verdicts import Verdicts
-from jawusd.formats.atomic import write_bytes_atomic
 from jawusd.formats.clips import LightCurve
 from jawusd.formats.model import JawModel
 from jawusd.formats.tracks import LOST, PARTIAL, RECOVERED, TRACKED, Tracks, uncovered_percent
 from jawusd.geometry import so3_log, transform_point, transform_points
-from jawusd.report.style import BLACK, BLUE, DPI, GREEN, GREY, ORANGE, SKY, VERMILION, figure_bytes, new_figure
+from jawusd.report.style import BLACK, BLUE, GREEN, GREY, ORANGE, SKY, VERMILION, new_figure, write_figure
 from jawusd.report.verdicts import GOOD, LOOK
 
 _COLUMNS = 1200  # maximum number of points per curve; in longer takes, groups of frames are reduced to their extremes
@@ -138,18 +137,12 @@ def legend_beside(axis: Axes) -> None:
     axis.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
 
 
-def draw_sync(curves: Mapping[str, LightCurve], offsets: Mapping[str, int] | None, title: str, path: Path) -> None:
-    """Plot the brightness of all clips, in full and around the first and last flash, to a PNG or SVG file.
-
-    Frame k of a camera is simultaneous with frame k + offset of the reference camera; without offsets, the clips are
-    plotted only as recorded. Raises OutputError.
-    """
-    kind = path.suffix.lower().lstrip(".")
-    write_bytes_atomic(path, figure_bytes(sync_figure(curves, offsets, title), kind, DPI))
-
-
 def sync_figure(curves: Mapping[str, LightCurve], offsets: Mapping[str, int] | None, title: str) -> Figure:
-    """Return the figure of `draw_sync`: one row of plots as recorded and, with offsets, a row of aligned plots."""
+    """Plot the brightness of all clips, in full and around the first and last flash, as recorded and aligned.
+
+    Frame k of a camera is simultaneous with frame k + offset of the reference camera; without offsets, there is only
+    the row of plots as recorded.
+    """
     rows: list[tuple[str, str, Mapping[str, int]]] = [("as recorded", "frame of each camera", dict.fromkeys(curves, 0))]
     if offsets is not None:
         rows.append(("aligned", "frame of the reference camera", offsets))
@@ -301,4 +294,4 @@ def save_strip(path: Path, frames: Array, verdicts: Verdicts) -> None:
     lines.set_xlabel("frame")
     lines.set_ylabel("mm")
     lines.legend(frameon=False)
-    write_bytes_atomic(path, figure_bytes(figure, "png", DPI))
+    write_figure(path, figure, "png")

@@ -32,7 +32,7 @@ SETTINGS: dict[RcKeyType, object] = {
     "svg.fonttype": "none",
     "svg.hashsalt": "jawusd",  # makes the ids in SVG files reproducible
 }
-DPI, _INLINE_DPI = 150, 110
+_DPI, _INLINE_DPI = 150, 110
 _PX_PER_PT = 4 / 3
 # Colours that are replaced by variables of the page's style sheet; white is the background of text.
 _THEMED = {
@@ -69,8 +69,13 @@ def save_figure(figure: Figure, folder: Path, name: str) -> list[Path]:
     """Write a figure as PNG and SVG, atomically, and return the files; raises OutputError."""
     files = [folder / f"{name}.png", folder / f"{name}.svg"]
     for file in files:
-        write_bytes_atomic(file, figure_bytes(figure, file.suffix[1:], DPI))
+        write_figure(file, figure)
     return files
+
+
+def write_figure(path: Path, figure: Figure, kind: str = "") -> None:
+    """Write a figure to a file, atomically, as a kind of file or by its suffix; raises OutputError."""
+    write_bytes_atomic(path, figure_bytes(figure, kind or path.suffix.lower().lstrip("."), _DPI))
 
 
 def figure_bytes(figure: Figure, kind: str, dpi: int, *, transparent: bool = False) -> bytes:
