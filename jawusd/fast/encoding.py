@@ -37,7 +37,6 @@ from jawusd.fast.kinds import (
     motion_by_displacement,
     motion_derivative,
     parameters_at,
-    scratch,
 )
 from jawusd.fast.rigid import Vector, device, solve
 
@@ -53,18 +52,6 @@ class Problem(NamedTuple):
     chart: int
     vectors: Array
     target: Array
-
-
-class Normal(NamedTuple):
-    """Scratch memory for the normal equations of one search."""
-
-    A: Array
-    g: Array
-    A_trial: Array
-    g_trial: Array
-    damped: Array
-    step: Array
-    trial: Array
 
 
 @device
@@ -110,84 +97,69 @@ def _velocity(S: Array, k: int, y0: float, y1: float, y2: float, h: float) -> Ve
 
 
 @device
-def descend(model: Array, problem: Problem, x: Array, w: Scratch, n: Normal) -> None:
+def descend(model: Array, problem: Problem, x: Array, w: Scratch) -> None:
     """Move x (3,) to the minimum of the squared residual; set x to NaN if the residual at the start is not finite."""
-    cost = equations(model, problem, x, w, n.A, n.g)
+    A, g, A_trial, g_trial = np.empty((3, 3)), np.empty(3), np.empty((3, 3)), np.empty(3)
+    damped, step, trial = np.empty((3, 3)), np.empty(3), np.empty(3)
+    cost = equations(model, problem, x, w, A, g)
     if not isfinite(cost):
         x[:] = np.nan
         return
     damping = START_DAMPING
     for _ in range(ITERATIONS):
-        n.damped[:] = n.A
+        damped[:] = A
         for i in range(3):
-            n.damped[i, i] += damping * ((n.A[0, 0] + n.A[1, 1] + n.A[2, 2]) / 3.0) + MIN_STIFFNESS
-        solve(n.damped, n.g, n.step)
+            damped[i, i] += damping * ((A[0, 0] + A[1, 1] + A[2, 2]) / 3.0) + MIN_STIFFNESS
+        solve(damped, g, step)
         for i in range(3):
-            n.trial[i] = x[i] - n.step[i]
-        settled = max(abs(n.step[0]), abs(n.step[1]), abs(n.step[2])) <= TOLERANCE_MM
+            trial[i] = x[i] - step[i]
+        settled = max(abs(step[0]), abs(step[1]), abs(step[2])) <= TOLERANCE_MM
         if settled or damping >= MAX_DAMPING:
-            x[:] = n.trial  # the last step doubles the number of correct digits, so it needs no further evaluation
+            x[:] = trial  # the last step doubles the number of correct digits, so it needs no further evaluation
             return
-        trial_cost = equations(model, problem, n.trial, w, n.A_trial, n.g_trial)
+        trial_cost = equations(model, problem, trial, w, A_trial, g_trial)
         if trial_cost <= cost:
             cost = trial_cost
-            x[:], n.A[:], n.g[:] = n.trial, n.A_trial, n.g_trial
+            x[:], A[:], g[:] = trial, A_trial, g_trial
             damping = max(damping * 0.1, MIN_DAMPING)
         else:
             damping *= 10.0
 
 
-class Encoding(NamedTuple):
-    """Scratch memory for encoding one pose after another."""
-
-    w: Scratch
-    n: Normal
-    target: Array
-    x: Array
-    product: Array
-
-
 @device
-def encoding_scratch(model: Array) -> Encoding:
-    """Allocate the scratch memory for encoding."""
-    A, g = np.empty((3, 3)), np.empty(3)
-    n = Normal(A, g, np.empty_like(A), np.empty_like(g), np.empty_like(A), np.empty_like(g), np.empty_like(g))
-    return Encoding(scratch(model), n, np.empty((3, 4)), np.empty(3), np.empty((4, 4)))
-
-
-@device
-def encode(model: Array, T: Array, e: Encoding) -> float:
-    """Write the d [mm] whose pose is nearest to T (4, 4) to e.x and return the residual [mm]."""
-    vectors = model[VECTORS : VECTORS + 16].reshape(4, 4)
-    M = e.w.M
-    _motion_of_pose(model, T, e.product, M)
+def encode(model: Array, T: Array, w: Scratch, x: Array) -> float:
+    """Write the d [mm] whose pose is nearest to T (4, 4) to x (3,) and return the residual [mm]."""
+    vectors, target = model[VECTORS : VECTORS + 16].reshape(4, 4), np.empty((3, 4))
+    M = w.M
+    _motion_of_pose(model, T, M)
     for i in range(3):
         for j in range(4):
             total = 0.0
             for k in range(4):
                 total += M[i, k] * vectors[k, j]
-            e.target[i, j] = total
+            target[i, j] = total
     p0, p1, p2 = model[INCISOR], model[INCISOR + 1], model[INCISOR + 2]
     for i in range(3):
-        e.x[i] = M[i, 0] * p0 + M[i, 1] * p1 + M[i, 2] * p2 + M[i, 3] - model[INCISOR + i]
+        x[i] = M[i, 0] * p0 + M[i, 1] * p1 + M[i, 2] * p2 + M[i, 3] - model[INCISOR + i]
     if model[STARTS] == 0:
         # a search over the displacement need not evaluate the gauge; the nearest pose does not depend on the chart
-        descend(model, Problem(DISPLACEMENT, vectors, e.target), e.x, e.w, e.n)
-        u = (e.x[0], e.x[1], e.x[2])
-        displaced(model, u, e.w)
-        e.x[0], e.x[1], e.x[2] = parameters_at(model, u)
-        if isnan(e.x[0]):
+        descend(model, Problem(DISPLACEMENT, vectors, target), x, w)
+        u = (x[0], x[1], x[2])
+        displaced(model, u, w)
+        x[0], x[1], x[2] = parameters_at(model, u)
+        if isnan(x[0]):
             return np.nan
     else:
-        _nearest_start(model, e.x)
-        descend(model, Problem(PARAMETERS, vectors, e.target), e.x, e.w, e.n)
-        motion(model, e.x[0], e.x[1], e.x[2], e.w)
-    return _residual_mm(vectors, e)
+        _nearest_start(model, x)
+        descend(model, Problem(PARAMETERS, vectors, target), x, w)
+        motion(model, x[0], x[1], x[2], w)
+    return _residual_mm(vectors, M, target)
 
 
 @device
-def _motion_of_pose(model: Array, T: Array, half: Array, M: Array) -> None:
+def _motion_of_pose(model: Array, T: Array, M: Array) -> None:
     """Write the first three rows of L^-1 T Q^-1 to M."""
+    half = np.empty((4, 4))
     for i in range(4):
         for k in range(4):
             total = 0.0
@@ -219,15 +191,15 @@ def _nearest_start(model: Array, x: Array) -> None:
 
 
 @device
-def _residual_mm(vectors: Array, e: Encoding) -> float:
-    """Return the distance [mm] between the vectors, moved by the motion in e.w, and their targets."""
+def _residual_mm(vectors: Array, M: Array, target: Array) -> float:
+    """Return the distance [mm] between the vectors, moved by a motion M (3, 4), and their targets."""
     total = 0.0
     for i in range(3):
         for j in range(4):
-            image = e.w.M[i, 3] * vectors[3, j]
+            image = M[i, 3] * vectors[3, j]
             for k in range(3):
-                image += e.w.M[i, k] * vectors[k, j]
-            total += (image - e.target[i, j]) ** 2
+                image += M[i, k] * vectors[k, j]
+            total += (image - target[i, j]) ** 2
     return sqrt(total)
 
 
@@ -263,22 +235,23 @@ def judge(
     judging: bool,
     residual_limit: float,
     margin_limit: float,
-    e: Encoding,
+    w: Scratch,
+    x: Array,
     v: Array,
 ) -> tuple[int, float, float]:
-    """Return reason, residual [mm] and margin [mm] of a pose T (4, 4), as in `evaluator.verdicts`; write d to e.x.
+    """Return reason, residual [mm] and margin [mm] of a pose T (4, 4), as in `evaluator.verdicts`; write d to x.
 
     If `judging` is false, only d and the residual are computed, and the reason is 0 for every rigid pose.
     """
-    e.x[:] = np.nan
+    x[:] = np.nan
     if not _finite(T):
         return _NOT_FINITE, np.nan, np.nan
     if not _rigid(T):
         return _NOT_RIGID, np.nan, np.nan
-    residual = encode(model, T, e)
+    residual = encode(model, T, w, x)
     if not judging:
         return 0, residual, np.nan
-    out, _, _ = signed_distance(bound, e.x[0], e.x[1], e.x[2], v)
+    out, _, _ = signed_distance(bound, x[0], x[1], x[2], v)
     reason = 0 if residual <= residual_limit else _OFF_MODEL
     if -out < margin_limit - ON_BOUND_MM or isnan(out):
         reason |= _OUTSIDE_BOUNDS

@@ -23,7 +23,7 @@ from jawusd.evaluator.kinds import KINDS
 from jawusd.evaluator.models import AnchoredModel, JawModelForm
 from jawusd.evaluator.motions import RigFrames
 from jawusd.evaluator.verdicts import Limits, Verdicts
-from jawusd.fast.encoding import encoding_scratch, judge
+from jawusd.fast.encoding import judge
 from jawusd.fast.hull import hull_scratch, packed_bound, signed_distance, signed_distance_gradient
 from jawusd.fast.kinds import (
     ADJOINT,
@@ -42,11 +42,7 @@ from jawusd.geometry.rodrigues import apply_series, cross, dot
 
 
 def packed_model(model: JawModelForm, frames: RigFrames, vectors: Array) -> Array:
-    """Return a packed model; see `encoding.landmark_vectors` for the vectors (4, 4) [mm].
-
-    Raises:
-        TypeError: the kind of model has no compiled form.
-    """
+    """Return a packed model, for vectors (4, 4) [mm] of `landmark_vectors`; raise TypeError without a compiled form."""
     centres, starts = (len(model.centres), None) if isinstance(model, AnchoredModel) else (0, model.starts)
     head: list[ArrayLike] = [
         [KINDS.index(model.kind), centres, 0 if starts is None else len(starts.d), 0],
@@ -207,10 +203,10 @@ def judge_rows(
 
     Encoding and judging share one function: compiling a second one would take a tenth of the total compile time.
     """
-    e, v = encoding_scratch(model), hull_scratch(bound)
+    w, x, v = scratch(model), np.empty(3), hull_scratch(bound)
     for row in range(len(T)):
-        why, residual, margin = judge(model, bound, T[row], judging, residual_limit_mm, margin_limit_mm, e, v)
-        out[row, 0], out[row, 1], out[row, 2] = e.x[0], e.x[1], e.x[2]
+        why, residual, margin = judge(model, bound, T[row], judging, residual_limit_mm, margin_limit_mm, w, x, v)
+        out[row, 0], out[row, 1], out[row, 2] = x[0], x[1], x[2]
         out[row, 3], out[row, 4], out[row, 5] = residual, margin, why
 
 
