@@ -76,15 +76,10 @@ def smooth_tangents(frames: Array, keys: Array, given: Array | None = None) -> A
 
 
 def error_growth_at(captured_d: Array, d: Array, distance_mm: Array) -> tuple[Array, Array]:
-    """Return how the error of a model grows away from its captured poses: a factor (n,) and a reach (n,) [mm].
+    """Return how the error of a model grows away from captured_d (p, 3) [mm], p > 0: factor (n,) and reach (n,) [mm].
 
-    The rms error is ``base_mm * factor + per_mm * reach``. The factor exceeds 1 beyond the widest captured opening,
-    where the path of the condyles is unknown.
-
-    Args:
-        captured_d: Jaw parameters of the captured poses [mm], shape (p, 3), p > 0.
-        d: Jaw parameters [mm], shape (n, 3).
-        distance_mm: Distances from d to the nearest captured_d [mm], shape (n,).
+    The rms error at d (n, 3), at distances (n,) from the nearest captured_d, is ``base_mm * factor + per_mm * reach``.
+    The factor exceeds 1 beyond the widest captured opening, where the path of the condyles is unknown.
     """
     widest = captured_d[:, 0].max()
     beyond = np.maximum(d[:, 0] - widest, 0.0) / max(widest, _NARROWEST_MM)

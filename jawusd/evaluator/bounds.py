@@ -19,6 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jawusd.base.arrays import Array, Mask
+from jawusd.base.errors import EvaluatorError
 from jawusd.evaluator.curves import flat_ended
 from jawusd.evaluator.formula import BoundFormula
 
@@ -132,7 +133,11 @@ class SliceHull:
         return np.array([d1 for d1, _ in known]), np.array([middle for _, middle in known]).reshape(-1, 2)
 
     def candidates(self) -> Array:
-        """Return starting points (n, 3) [mm] of searches, spread over the valid volume and denser near its surface."""
+        """Return starting points (n, 3) [mm] of searches, spread over the valid volume and denser near its surface.
+
+        Raises:
+            EvaluatorError: the valid volume is empty.
+        """
         points = []
         for d1, outline in self._sharp_outlines(_CANDIDATE_SLICES):
             centre = outline.mean(axis=0)
@@ -140,7 +145,12 @@ class SliceHull:
             section = np.concatenate([[centre], *(centre + radius * reach for radius in _CANDIDATE_RADII)])
             points.append(np.column_stack([np.full(len(section), d1), section]))
         found = np.concatenate([np.empty((0, 3)), *points])
-        return found[self.signed_distance(found) <= 0]
+        valid = self.signed_distance(found) <= 0
+        if not valid.any():
+            raise EvaluatorError(
+                "the bound of this rig leaves no valid jaw parameters.", hint="Fit the model again with a wider margin."
+            )
+        return found[valid]
 
     def _sharp_outlines(self, count: int) -> list[tuple[float, Array]]:
         """Return openings and the outlines (n, 2) of their unrounded sections that are not empty."""

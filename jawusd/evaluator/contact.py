@@ -186,11 +186,7 @@ class RigClearance:
 
 
 def check_contact(arrays: Mapping[str, Array], name: str) -> None:
-    """Check the clearance whose arrays have a given name prefix.
-
-    Raises:
-        EvaluatorError: Values out of range, or counts that do not match.
-    """
+    """Raise EvaluatorError if a clearance whose arrays have a name prefix has values out of range or unequal counts."""
     shape, count = arrays[f"{name}_shape"], arrays[f"{name}_values"].size
     if (shape != np.round(shape)).any() or (shape < 2).any() or shape.prod() != count:
         raise EvaluatorError(

@@ -94,11 +94,7 @@ class GlideTable:
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, Array]) -> GlideTable | None:
-        """Build the surface from the named arrays of a rig; None if it has none.
-
-        Raises:
-            EvaluatorError: The surface is not 0 at the closed bite.
-        """
+        """Build the surface from a rig's arrays, None without one; raise EvaluatorError if not 0 in occlusion."""
         if "glide_d2" not in arrays:
             return None
         knots, factors = (

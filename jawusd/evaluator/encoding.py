@@ -171,10 +171,8 @@ class Encoder:
     def most_likely(self, T: Array, whitening: Array, start: Array, bound: SliceHull | None) -> Array:
         """Return the most likely d (n, 3) of noisy poses T (n, 4, 4): minimise ``|W xi|^2``, ``T = exp(xi) pose(d)``.
 
-        Args:
-            whitening: W with ``W^T W`` the inverse covariance of xi, (omega, v), skull frame, shape (n, 6, 6).
-            start: Initial d [mm], shape (n, 3), inside the bound if given. NaN gives NaN.
-            bound: The bound that d must stay inside.
+        ``W^T W`` (n, 6, 6) is the inverse covariance of xi, (omega, v), skull frame. The start (n, 3) [mm] must lie in
+        the bound, if given, and d stays inside. NaN gives NaN.
         """
         measured = make_transform(*self.frames.motions(T))
         whitening = whitening @ self.frames.adjoint
@@ -232,11 +230,7 @@ def covariance_of_points(points: Array, sigma_mm: Array) -> Array:
 
 
 def whitening_of(covariance: Array) -> Array:
-    """Return W (n, 6, 6) with ``W^T W`` the inverse of the covariances (n, 6, 6); NaN for NaN.
-
-    Raises:
-        ValueError: a covariance is not positive definite.
-    """
+    """Return W (n, 6, 6), ``W^T W`` the inverse of covariances, NaN for NaN; raise ValueError for indefinite ones."""
     lost = np.asarray(np.isnan(covariance).any(axis=(1, 2)))
     try:
         factor = np.linalg.cholesky(np.where(lost[:, None, None], np.eye(6), covariance))

@@ -56,6 +56,15 @@ class GaugeNumbers(NamedTuple):
     fade_mm: float  # opening over which the glide surface fades out
     glide: object = None  # table of the glide surface, as `gauge.Elementary.glide` expects it; None without one
 
+    @classmethod
+    def of(cls, arrays: Arrays, glide: object = None) -> GaugeNumbers:
+        """Return the scalars in the named arrays of a rig, with a table of the glide surface."""
+        path_x, path_z = (tuple(each) for each in rows(arrays["path_coefficients"], 5))
+        (scale_mm,), (low_mm, high_mm) = arrays["path_scale_mm"], arrays["path_limits"]
+        terms = (tuple(arrays["glide_arch"]), tuple(arrays["glide_drop"]))
+        (softness_mm,), (fade_mm,) = arrays["glide_softness_mm"], arrays["glide_fade_mm"]
+        return cls(path_x, path_z, scale_mm, low_mm, high_mm, *terms, softness_mm, fade_mm, glide)
+
 
 def long_angle_series() -> list[list[float]]:
     """Return a, b and c of `jawusd.geometry.rodrigues` as series of the squared angle [rad^2], to 1e-8 up to 2 rad."""
@@ -215,13 +224,8 @@ def spline(
     Far from the centres the cubes of distances nearly cancel. If ``sum_i W_i = 0`` and ``sum_i W_i c_i = 0``, the cubes
     are replaced by what remains after cancellation, so that single precision suffices. With ``r = |q - c|``, ``p^2 =
     |q|^2 + 1`` and ``e = c (2 q - c) + 1 = p^2 - r^2``, this is ``r^3 = p^3 - 3/2 p e + (e / (r + p))^2 (r + p / 2)``,
-    in which the sums of ``p^3 W_i`` and of ``p q c_i W_i`` vanish.
-
-    Args:
-        q: The argument; see `spline_input`.
-        centres, weights: c_i and W_i, one per row.
-        linear: L, 3 inputs times 3 outputs.
-        spread: See `spread_of`.
+    in which the sums of ``p^3 W_i`` and of ``p q c_i W_i`` vanish. `spline_input` gives q, `spread_of` the spread; c_i,
+    W_i and L are given by rows.
     """
     kernels = []
     reference = None if spread is None else ops.sqrt(dot(q, q) + 1.0)
@@ -259,10 +263,6 @@ class RigidMotion(Generic[N]):
     omega: Triple[N]  # rotation vector [rad]
     turn: tuple[Triple[N], Triple[N], Triple[N]]  # rows of the rotation matrix minus the identity
     t: Triple[N]  # translation [mm]
-
-    def carry(self, p: Triple[N]) -> Triple[N]:
-        """Return the point [mm] to which the motion moves a point [mm]."""
-        return triple([p[i] + dot(self.turn[i], p) + self.t[i] for i in range(3)])
 
 
 def anchored_motion(

@@ -206,19 +206,8 @@ class Gauge:
     numbers: GaugeNumbers = field(init=False, repr=False)  # all of the above as floats
 
     def __post_init__(self) -> None:
-        path_x, path_z = self.path_coefficients.tolist()
-        numbers = GaugeNumbers(
-            tuple(path_x),
-            tuple(path_z),
-            self.path_scale_mm,
-            *self.path_limits,
-            tuple(self.glide_arch.tolist()),
-            tuple(self.glide_drop.tolist()),
-            self.glide_softness_mm,
-            self.glide_fade_mm,
-            self.glide,
-        )
-        object.__setattr__(self, "numbers", numbers)
+        flat = {name: value.ravel().tolist() for name, value in self.arrays().items()}
+        object.__setattr__(self, "numbers", GaugeNumbers.of(flat, self.glide))
 
     def arrays(self) -> dict[str, Array]:
         """Return the gauge's arrays by their names in a rig."""

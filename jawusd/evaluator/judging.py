@@ -130,18 +130,18 @@ class RigJudging(RigClearance, RigArrays):
         limit_mm = self.contact.limit_mm if measured else -AUTHORED_MM
         if len(verdicts.d) == 1 and not self.contact.collides_at(verdicts.d, limit_mm):
             return verdicts
-        return verdicts.with_collisions(self.contact.collides(verdicts.d, limit_mm))
+        return verdicts.flagged(Reason.TEETH_COLLIDE, self.contact.collides(verdicts.d, limit_mm))
 
     def _with_speed(
         self, verdicts: Verdicts, poses: Array, batch: tuple[int, ...], times_s: ArrayLike | None, limits: Limits
     ) -> Verdicts:
         """Return the verdicts in batch shape, with frames that exceed the speed limit marked."""
+        finished = verdicts.finished(batch, limits.tolerance_mm)
         if limits.speed_mm_s is None:
-            return verdicts.finished(batch, limits.tolerance_mm)
+            return finished
         measured = np.where(verdicts.measured()[:, None, None], poses, np.nan)
         positions = transform_points(measured, self.landmarks[None]).reshape(*batch, -1, 3)
-        fast = too_fast(positions, verdicts.valid.reshape(batch), times_s, limits.speed_mm_s)
-        return verdicts.finished(batch, limits.tolerance_mm, fast)
+        return finished.flagged(Reason.TOO_FAST, too_fast(positions, finished.valid, times_s, limits.speed_mm_s))
 
     def verdicts(
         self,
@@ -210,9 +210,8 @@ class VerdictStream:
         positions = transform_points(T, self._landmarks)
         if self._speed_limit_mm_s is not None and self.last_good is not None:
             elapsed_s = time_s - self.last_good.time_s
-            if exceeds(positions - self._positions, elapsed_s, self._speed_limit_mm_s):
-                reason = verdict.reason | np.uint8(Reason.TOO_FAST.value)
-                verdict = verdict._replace(valid=reason == 0, reason=reason)
+            fast = exceeds(positions - self._positions, elapsed_s, self._speed_limit_mm_s)
+            verdict = verdict.flagged(Reason.TOO_FAST, fast)
         if verdict.valid:
             self.last_good, self._positions = GoodPose(time_s, T.copy(), verdict.d), positions
         return verdict

@@ -92,12 +92,10 @@ class NumpyKernels:
         return _with_cost(residual, minimise(residual, start, self._bound))
 
     def solve_ik(self, handles: Handles, targets: Array, start: Array) -> tuple[Array, Array]:
-        """Return d (n, 3) [mm] inside the bound that move handles nearest to targets, and squared distances (n,).
+        """Return d (n, 3) [mm] inside the bound that move m handles nearest to targets, and squared distances (n,).
 
-        Args:
-            handles: The m points of the mandible.
-            targets: Their target positions, anatomical frame [mm], scaled by the weights of the handles, (n, 3, m).
-            start: Initial d [mm] inside the bound, shape (n, 3); the results are the local minima around them.
+        The targets (n, 3, m) are in the anatomical frame [mm], scaled by the weights of the handles. The results are
+        the local minima around the starts (n, 3) [mm] inside the bound.
         """
         residual = distance_residual(self._model.decode_derivative, handles, targets)
         if len(start) != 1:

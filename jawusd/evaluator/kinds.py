@@ -136,18 +136,6 @@ class AnchoredFormula:
     optional: ClassVar[dict[str, dict[str, ArraySpec]]] = {"glide_d2": GLIDE_ARRAYS}
 
     def __init__(self, arrays: Arrays) -> None:
-        path_x, path_z = rows(arrays["path_coefficients"], 5)
-        gauge = GaugeNumbers(
-            path_x=path_x,
-            path_z=path_z,
-            path_scale_mm=arrays["path_scale_mm"][0],
-            low_mm=arrays["path_limits"][0],
-            high_mm=arrays["path_limits"][1],
-            arch=arrays["glide_arch"],
-            drop=arrays["glide_drop"],
-            softness_mm=arrays["glide_softness_mm"][0],
-            fade_mm=arrays["glide_fade_mm"][0],
-        )
         *weights, first, second, third = rows(arrays["spline_weights"], 3)
         linear = (first, second, third)
         self.tables = {"centres": rows(arrays["spline_centres"], 3), "weights": weights}
@@ -160,7 +148,7 @@ class AnchoredFormula:
         spread = spread_of(self.tables["centres"], weights)
         offset = spline((0.0, 0.0, 0.0), self.tables["centres"], weights, linear, spread, FloatOperations())
         incisor, scales = triple(arrays["incisor"]), arrays["spline_scales"]
-        self.numbers = AnchoredNumbers(gauge, incisor, scales, linear, offset, spread)
+        self.numbers = AnchoredNumbers(GaugeNumbers.of(arrays), incisor, scales, linear, offset, spread)
 
     def motion(
         self,

@@ -82,9 +82,9 @@ class JawModelForm(ABC):
         """Return starting points (n, 3), in chart coordinates, of searches for motions (R, t)."""
         return self.starts.nearest(R @ self.incisor + t - self.incisor)
 
-    def chart_motion(self, x: Array) -> tuple[Array, Array]:
-        """Return rotation and translation [mm] at chart coordinates x (n, 3) [mm]."""
-        return self.decode(x)
+    def chart_motion(self, x: Array) -> Array:
+        """Return the motions at chart coordinates x (n, 3) [mm] as transforms, shape (n, 4, 4)."""
+        return self.motion(x)
 
     def chart_derivative(self, x: Array) -> tuple[Array, Array, Array]:
         """Return rotation, translation [mm] and the derivative S (n, 6, 3) at chart coordinates x (n, 3) [mm]."""
@@ -156,8 +156,7 @@ class AnchoredModel(JawModelForm):
 
     def motion(self, d: Array) -> Array:
         """Return M(d) as transforms, shape (n, 4, 4)."""
-        u = self.gauge.displacement(d)
-        return anchored_motions(self.rotation(u), u + self.incisor, self.incisor)
+        return self.chart_motion(self.gauge.displacement(d))
 
     def decode_derivative(self, d: Array) -> tuple[Array, Array, Array]:
         """Return rotation, translation [mm] and the spatial derivative S (n, 6, 3) of M(d)."""
@@ -171,10 +170,9 @@ class AnchoredModel(JawModelForm):
         """Return the incisal displacement u (n, 3) [mm] of the motions (R, t), which is the chart's coordinate."""
         return R @ self.incisor + t - self.incisor
 
-    def chart_motion(self, x: Array) -> tuple[Array, Array]:
-        """Return rotation and translation of the motion that displaces the incisal point by x (n, 3) [mm]."""
-        M = anchored_motions(self.rotation(x), x + self.incisor, self.incisor)
-        return M[:, :3, :3], M[:, :3, 3]
+    def chart_motion(self, x: Array) -> Array:
+        """Return the motions that displace the incisal point by x (n, 3) [mm] as transforms, shape (n, 4, 4)."""
+        return anchored_motions(self.rotation(x), x + self.incisor, self.incisor)
 
     def chart_derivative(self, x: Array) -> tuple[Array, Array, Array]:
         """Return rotation, translation [mm] and the spatial derivative (n, 6, 3) with respect to x (n, 3) [mm]."""

@@ -94,10 +94,8 @@ def lowest_in_valley(
 ) -> Vector:
     """Return the minimiser of a cost inside the bound, in the basin of a valid start [mm]; NaN for NaN.
 
-    Args:
-        pull: Function that returns the cost and its quadratic model at a point.
-        exact: Whether the quadratic model is exact. Steps then first use the full Hessian of the bound and, if that
-            fails, only its positive semidefinite part.
+    `pull` returns the cost and its quadratic model at a point. If the model is `exact`, steps first use the full
+    Hessian of the bound and, if that fails, only its positive semidefinite part.
     """
     if not math.isfinite(sum(start)):
         return _UNKNOWN

@@ -26,6 +26,11 @@ def polynomial(coefficients: Sequence[N | float], x: N) -> N:
     return value
 
 
+def polynomials(coefficients: Sequence[Sequence[N | float]], x: N) -> list[N]:
+    """Return several polynomials of x."""
+    return [polynomial(each, x) for each in coefficients]
+
+
 class Operations(Protocol[N, Table]):
     """Operations of a number type beyond arithmetic."""
 
@@ -66,16 +71,12 @@ class FloatOperations:
     sqrt = staticmethod(math.sqrt)
     exp = staticmethod(math.exp)
     angle_coefficients = staticmethod(angle_coefficients)
+    polynomials = staticmethod(polynomials)
 
     @staticmethod
     def clip(x: float, low: float, high: float) -> float:
         """Return x limited to [low, high]."""
         return min(max(x, low), high)
-
-    @staticmethod
-    def polynomials(coefficients: Sequence[Sequence[float]], x: float) -> list[float]:
-        """Return several polynomials of x."""
-        return [polynomial(each, x) for each in coefficients]
 
     @staticmethod
     def log_sum_exp(terms: Sequence[float]) -> float:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Mapping
 from functools import partial
 from typing import overload
@@ -11,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from jawusd.base.arrays import Array, Indices
-from jawusd.base.errors import EvaluatorError, FormatError
+from jawusd.base.errors import AnyPath, EvaluatorError, FormatError
 from jawusd.base.npz import read_npz, upgraded_model
 from jawusd.evaluator.authoring import RigAuthoring
 from jawusd.evaluator.batching import as_floats, as_points, as_rows, in_chunks, pairs_in_chunks, rows_of
@@ -289,7 +288,7 @@ class JawRig(RigJudging, RigAuthoring):
         return IkResult(d.reshape(*batch, 3), distance_mm.reshape(batch))
 
 
-def load(path: str | os.PathLike[str]) -> JawRig:
+def load(path: AnyPath) -> JawRig:
     """Read a rig from a ``model.npz`` of format jawusd-model/2, as `jawusd fit` writes it.
 
     Raises:

@@ -9,7 +9,6 @@ from typing import NamedTuple
 import numpy as np
 
 from jawusd.base.arrays import Array, Indices
-from jawusd.base.errors import EvaluatorError
 from jawusd.evaluator.batching import pairs_in_chunks
 from jawusd.evaluator.bounds import SliceHull
 from jawusd.evaluator.encoding import Handles
@@ -46,18 +45,10 @@ class BoundedSearch:
     @cached_property
     def _scan(self) -> _Scan:
         points = self._bound.candidates()
-        if not len(points):
-            raise EvaluatorError(
-                "the bound of this rig leaves no valid jaw parameters.", hint="Fit the model again with a wider margin."
-            )
         return _Scan(points, *pairs_in_chunks(self._model.decode, points))
 
     def nearest(self, d: Array) -> Array:
-        """Return the nearest points (n, 3) [mm] inside the bound; points of d (n, 3) that are inside are unchanged.
-
-        Raises:
-            EvaluatorError: the valid volume is empty.
-        """
+        """Return the nearest points (n, 3) [mm] in the bound, d (n, 3) if inside; raise EvaluatorError without any."""
         valid = d.copy()
         out = np.flatnonzero(self._bound.signed_distance(d) > 0)
         if not out.size:
@@ -83,11 +74,7 @@ class BoundedSearch:
         return found
 
     def solve_ik_multistart(self, handles: Handles, target: Array) -> tuple[Array, Array]:
-        """Return the valid d (n, 3) [mm] that move handles nearest to targets (n, 3, m), and squared distances (n,).
-
-        Raises:
-            EvaluatorError: the valid volume is empty.
-        """
+        """Return valid d (n, 3) [mm] that move handles nearest to targets (n, 3, m), and squared distances (n,)."""
         images = handles.features(self._scan.images(handles.vectors), self._scan.points)
         wanted = handles.features(target, np.zeros((len(target), 3)))
         best, least = self._best(

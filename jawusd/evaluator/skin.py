@@ -23,7 +23,6 @@ that limit. The arrays of the file, for M training frames, K columns, C componen
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
 from typing import NamedTuple
 
@@ -31,7 +30,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from jawusd.base.arrays import Array, Mask
-from jawusd.base.errors import EvaluatorError, FormatError
+from jawusd.base.errors import AnyPath, EvaluatorError, FormatError
 from jawusd.base.npz import read_npz, take
 from jawusd.evaluator.batching import as_floats, as_rows, in_chunks
 
@@ -165,7 +164,7 @@ def components(X: Array, mean: Array, basis: Array, scale: float) -> tuple[Array
     return f, np.maximum((centred * centred).sum(axis=1) - (f * f).sum(axis=1), 0.0)
 
 
-def load_skin(path: str | os.PathLike[str]) -> Skin:
+def load_skin(path: AnyPath) -> Skin:
     """Read a map from skin to d, written by `jawusd skin-fit`.
 
     Raises:

@@ -82,11 +82,7 @@ def _denoised(seen: Array, noise: Array) -> Array:
 
 
 def check_speeds(arrays: Mapping[str, Array]) -> None:
-    """Check the speeds in the named arrays of a rig.
-
-    Raises:
-        EvaluatorError: A covariance is not symmetric and positive definite.
-    """
+    """Raise EvaluatorError if a covariance among the arrays of a rig is not symmetric and positive definite."""
     for name in ("velocity_covariance", "acceleration_covariance"):
         value = arrays[name]
         if (np.abs(value - value.T) > 1e-9 * np.abs(value).max()).any() or np.linalg.eigvalsh(value).min() <= 0:

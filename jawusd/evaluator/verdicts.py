@@ -69,23 +69,21 @@ class Verdicts(NamedTuple):
         reason[self.measured() & _outside(margin_mm, limits)] |= Reason.OUTSIDE_BOUNDS.value
         return self._replace(valid=reason == 0, reason=reason, margin_mm=margin_mm)
 
-    def with_collisions(self, collide: Mask) -> Verdicts:
-        """Return the verdicts with the poses in ``collide`` (n,) marked as colliding."""
-        if not np.count_nonzero(collide):  # ten times as fast as `any`
+    def flagged(self, flag: Reason, where: Mask) -> Verdicts:
+        """Return the verdicts with the poses in a mask (...) marked as invalid for a reason."""
+        if not np.count_nonzero(where):  # ten times as fast as `any`
             return self
-        reason = self.reason | np.where(collide, Reason.TEETH_COLLIDE.value, 0).astype(np.uint8)
+        reason = self.reason | np.where(where, flag.value, 0).astype(np.uint8)
         return self._replace(valid=reason == 0, reason=reason)
 
-    def finished(self, batch: tuple[int, ...], tolerance_mm: float, fast: Mask | None = None) -> Verdicts:
-        """Return the verdicts in a batch shape, with their tolerance and the frames in ``fast`` marked too fast."""
-        if not batch and fast is None:
+    def finished(self, batch: tuple[int, ...], tolerance_mm: float) -> Verdicts:
+        """Return the verdicts in a batch shape, with their tolerance."""
+        if not batch:
             valid, reason, residual_mm, margin_mm, d, _ = self
             return Verdicts(valid[0], reason[0], residual_mm[0], margin_mm[0], d[0], tolerance_mm)
-        reason = self.reason.reshape(batch)
-        if fast is not None:
-            reason = reason | np.where(fast, Reason.TOO_FAST.value, 0).astype(np.uint8)
+        valid, reason = self.valid.reshape(batch), self.reason.reshape(batch)
         residual_mm, margin_mm = self.residual_mm.reshape(batch), self.margin_mm.reshape(batch)
-        return Verdicts(reason == 0, reason, residual_mm, margin_mm, self.d.reshape(*batch, 3), tolerance_mm)
+        return Verdicts(valid, reason, residual_mm, margin_mm, self.d.reshape(*batch, 3), tolerance_mm)
 
     def inside(self) -> Mask:
         """Return which poses lie inside the bound, shape (...), regardless of other reasons."""
@@ -124,11 +122,7 @@ class Limits:
     speed_mm_s: float | None = None  # largest speed of any landmark since the last valid pose; None disables the check
 
     def replaced(self, residual_mm: float | None, tolerance_mm: float | None, speed_mm_s: float | None) -> Limits:
-        """Return the limits, with the given ones replaced.
-
-        Raises:
-            ValueError: a tolerance that is negative or NaN.
-        """
+        """Return the limits, with the given ones replaced; raise ValueError for a tolerance that is negative or NaN."""
         if residual_mm is None and tolerance_mm is None and speed_mm_s is None:
             return self
         if tolerance_mm is not None and not tolerance_mm >= 0:
@@ -164,14 +158,10 @@ def too_fast(positions: Array, valid: Mask, times_s: ArrayLike | None, limit_mm_
 
     Measuring from the last good frame, not from the frame before, keeps one wrong frame from making the next one
     invalid. After a lasting jump, frames are too fast until the time since the last good frame suffices for the jump.
-
-    Args:
-        positions: Landmark positions [mm], shape (..., F, L, 3); NaN where there is no pose.
-        valid: Which frames are valid apart from their speed, shape (..., F).
-        times_s: Increasing times, shape (F,).
+    Positions of landmarks are (..., F, L, 3) [mm], NaN without a pose; `valid` (..., F) disregards the speed.
 
     Raises:
-        ValueError: there is no frame axis, or the times do not match it or do not increase.
+        ValueError: there is no frame axis, or the times (F,) do not match it or do not increase.
     """
     times = np.asarray([] if times_s is None else times_s, dtype=np.float64)
     if positions.ndim < 3 or times.shape != positions.shape[-3:-2] or not (np.diff(times) > 0).all():

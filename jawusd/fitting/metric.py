@@ -15,7 +15,7 @@ from scipy.spatial import ConvexHull, QhullError
 from jawusd.base.arrays import Array
 from jawusd.evaluator.encoding import landmark_vectors, nearest_in_chart, vector_images
 from jawusd.evaluator.models import JawModelForm
-from jawusd.geometry import hat, make_transform
+from jawusd.geometry import hat
 from jawusd.geometry.so3 import nearest_rotation
 
 _TOGETHER = 32  # number of poses per block, small enough that displacements stay in the CPU cache
@@ -55,14 +55,12 @@ class MandibleMetric:
     def nearest(self, model: JawModelForm, target: Array) -> tuple[Array, Array]:
         """Return the parameters (N, 3) [mm] and motions (N, 4, 4) of a model that are nearest to motions (N, 4, 4)."""
         x = nearest_in_chart(model, *_parts(target), self.vectors)
-        return model.chart_parameters(x), make_transform(*model.chart_motion(x))
+        return model.chart_parameters(x), model.chart_motion(x)
 
     def best_rotation(self, target: Array, incisor: Array, at: Array) -> Array:
         """Return the rotations (N, 3, 3) that best fit motions (N, 4, 4) with the incisal point fixed (Kabsch 1976).
 
-        Args:
-            incisor: incisal point at rest [mm], shape (3,).
-            at: fixed positions of the incisal point [mm], shape (N, 3).
+        The incisal point (3,) at rest is fixed `at` positions (N, 3) [mm].
         """
         R, t = _parts(target)
         mean, root = self.vectors[:3, 3], self.vectors[:3, :3]

@@ -23,20 +23,17 @@ _MIN_CURVATURE = 1e-9
 
 
 def encoded(chart: Chart, vectors: Tensor, target: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the parameters whose motion brings vectors closest to their targets.
+    """Return d (n, 3) [mm] whose motion brings vectors closest to their targets, and the residuals (n, 3 m) [mm].
 
     First and second derivatives with respect to the targets are exact, to the accuracy of the search. With its result
     x0, and the inverse Hessian H and Jacobian J there as constants, ``x1 = x0 + H J^T (target - target0)`` is correct
-    to first order; one step ``x2 = x1 - H grad(x1, target)`` makes it correct to second order.
+    to first order; one step ``x2 = x1 - H grad(x1, target)`` makes it correct to second order. Second derivatives of
+    the sum of squared residuals are exact, too, but not those of single residuals.
 
     Args:
         vectors: Homogeneous vectors (4, m), anatomical frame [mm].
         target: Target positions [mm], shape (n, 3, m).
         u: Displacements (n, 3) [mm] of the incisal point, where the search starts.
-
-    Returns:
-        d (n, 3) [mm], and the residuals (n, 3 m) [mm]: moved vectors minus targets. Second derivatives of their
-        sum of squares are exact; those of single residuals are not.
     """
     residual = _residual_of(chart, vectors)
     width = target.shape[1:]

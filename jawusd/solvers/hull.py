@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 
 from jawusd.base.arrays import Array
-from jawusd.base.errors import EvaluatorError
 from jawusd.evaluator import nearest as limits
 from jawusd.evaluator.arrays import flat_arrays
 from jawusd.evaluator.bounds import SliceHull
@@ -39,11 +38,7 @@ class Expansion(NamedTuple):
 
 
 class Hull(Formula):
-    """The slice hull of a rig; see `jawusd.evaluator.bounds`.
-
-    Raises:
-        EvaluatorError: the bound of the rig is empty.
-    """
+    """The slice hull of a rig, see `jawusd.evaluator.bounds`; raise EvaluatorError if it is empty."""
 
     directions: Tensor
     scan: Tensor
@@ -52,12 +47,7 @@ class Hull(Formula):
         formula = BoundFormula(flat_arrays(arrays))
         super().__init__(formula.tables, formula.numbers)
         self._formula = formula
-        points = SliceHull(arrays).candidates()
-        if not len(points):
-            raise EvaluatorError(
-                "the bound of this rig leaves no valid jaw parameters.", hint="Fit the model again with a wider margin."
-            )
-        self.register_buffer("scan", torch.tensor(_by_slices(points)))
+        self.register_buffer("scan", torch.tensor(_by_slices(SliceHull(arrays).candidates())))
 
     def margin(self, d: Tensor) -> Tensor:
         """Return the margins (n,) [mm] of d (n, 3) [mm], positive inside."""

@@ -16,7 +16,7 @@ from jawusd.base.arrays import Array
 from jawusd.evaluator.arrays import flat_arrays
 from jawusd.evaluator.formula import Numbers, RigidMotion, anchored_motion
 from jawusd.evaluator.kinds import MODELS
-from jawusd.evaluator.operations import Rows, polynomial, triple
+from jawusd.evaluator.operations import Rows, polynomials, triple
 from jawusd.geometry.rodrigues import SMALL_SQUARED_ANGLE, Triple, angle_quotients, angle_series
 from jawusd.solvers.solution import check_precision, full_precision
 
@@ -26,10 +26,8 @@ _TINY = 1e-30  # added to the argument of sqrt, which keeps the derivative at ze
 class TensorOperations:
     """`jawusd.evaluator.operations.Operations` on tensors; all derivatives are finite, including at zero."""
 
-    @staticmethod
-    def exp(x: Tensor) -> Tensor:
-        """Return the exponential."""
-        return torch.exp(x)
+    exp = staticmethod(torch.exp)
+    polynomials = staticmethod(polynomials)
 
     @staticmethod
     def clip(x: Tensor, low: float, high: float) -> Tensor:
@@ -51,11 +49,6 @@ class TensorOperations:
         angle = torch.sqrt(far)
         quotients = angle_quotients(far, angle, torch.sin(angle), torch.sin(0.5 * angle))
         return triple([torch.where(small, x, y) for x, y in zip(angle_series(near), quotients)])
-
-    @staticmethod
-    def polynomials(coefficients: Sequence[Sequence[float]], x: Tensor) -> list[Tensor]:
-        """Return several polynomials of x; their coefficients may be tensors."""
-        return [polynomial(each, x) for each in coefficients]
 
     @staticmethod
     def log_sum_exp(terms: Sequence[Tensor]) -> Tensor:

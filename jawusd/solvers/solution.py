@@ -112,11 +112,7 @@ def full_precision(function: Callable[P, R]) -> Callable[P, R]:
 
 
 def check_precision(name: str, found: torch.dtype, own: torch.dtype | None = None) -> None:
-    """Check the dtype of an argument, and that of the layer it is passed to, if any.
-
-    Raises:
-        TypeError: the two dtypes differ, or are coarser than float32.
-    """
+    """Raise TypeError if an argument's dtype differs from that of its layer, if any, or one is coarser than float32."""
     if own is not None and own not in _ALLOWED:
         raise TypeError(
             f"the layer was converted to {own}, which is too coarse for poses; it computes in float32 or float64. "
