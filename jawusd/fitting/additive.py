@@ -51,16 +51,14 @@ def in_millimetres(
     """Reparametrise a curve by d, the displacement of the incisal point along the curve's own axis [mm].
 
     Where the incisal point stands still or reverses, d increases by a fifth of the mandible's rms displacement instead,
-    so that every point on the curve has a parameter.
+    so that every point on the curve has a parameter. The curve over d, zero at d = 0, is returned with a mask of the
+    knots at which the incisal point advances steadily.
 
     Args:
         limits: range of t in the data, containing 0.
         root: L with |L^T xi| = rms displacement of the mandible under a small twist xi [mm], shape (6, 6).
         incisor: incisal point at rest [mm], shape (3,).
         axis: 0 opening, 1 laterotrusion, 2 protrusion.
-
-    Returns:
-        The curve over d, zero at d = 0, and a mask of the knots at which the incisal point advances steadily.
 
     Raises:
         FittingError: the curve does not move at all.

@@ -54,26 +54,17 @@ def fit_bounds(d: Array, alpha: float, closed_mm: float | None = None) -> dict[s
     `alpha` is as in `alpha_shape`, `closed_mm` as in `fit_slice_hull`.
     """
     hull, tolerances = fit_slice_hull(d, closed_mm)
-    return {**hull, **alpha_shapes(d, alpha), "d_range": valid_box(hull), **tolerances}
-
-
-def alpha_shapes(d: Array, alpha: float) -> dict[str, Array]:
-    """Return the `polygon_*` arrays of a model for captured parameters (N, 3) [mm]; `alpha` as in `alpha_shape`."""
-    arrays: dict[str, Array] = {}
+    arrays = dict(hull)
     for name, columns in PLANES.items():
         arrays[name], arrays[f"{name}_counts"] = alpha_shape(d[:, columns], alpha)
-    return arrays
+    return {**arrays, "d_range": valid_box(hull), **tolerances}
 
 
 def alpha_shape(points: Array, alpha: float) -> tuple[Array, Array]:
-    """Return the outer rings of an alpha shape of points (N, 2) [mm].
+    """Return the outer rings of an alpha shape of points (N, 2) [mm]; `alpha` is its largest circumradius [per range].
 
-    Args:
-        alpha: largest circumradius of a triangle [range-normalised units].
-
-    Returns:
-        Vertices of all rings [mm], shape (P, 2), each ring open (its first vertex is not repeated), counter-clockwise,
-        largest first; and the number of vertices of each ring (integers), shape (k,).
+    They are the vertices of all rings [mm], shape (P, 2), each ring open (its first vertex is not repeated),
+    counter-clockwise, largest first; and the number of vertices of each ring (integers), shape (k,).
     """
     low = points.min(0)
     unit = np.maximum(np.ptp(points, axis=0), _SMALLEST_RANGE_MM)
@@ -99,16 +90,11 @@ def _circumradius(corners: Array) -> Array:
 
 
 def fit_slice_hull(d: Array, closed_mm: float | None = None) -> tuple[dict[str, Array], dict[str, Array]]:
-    """Build the slice hull of captured parameters (N, 3) [mm] in temporal order.
+    """Return the slice hull of captured parameters (N, 3) [mm] in temporal order, and `tolerance_mm` and `held_out_*`.
 
-    Args:
-        closed_mm: d1 with closed teeth, where the hull ends; default: the smallest captured d1, apart from noise.
-
-    Returns:
-        The `slice_*` arrays of a model; and its `tolerance_mm` and `held_out_*` arrays. The tolerance for measured
-        poses is the 95 % quantile of the distance of held-out frames outside the hull, since other exercises reach
-        slightly farther than those captured. It is at most 1 mm, since a larger one would accept poses that no frame
-        shows.
+    The hull ends at the d1 of closed teeth; None: the smallest captured d1, apart from noise. The tolerance for
+    measured poses is the 95 % quantile of the distance of held-out frames outside the hull, since other exercises reach
+    slightly farther than those captured. It is at most 1 mm, since a larger one would accept poses that no frame shows.
     """
     blocks = np.arange(len(d)) // min(_BLOCK, max(1, len(d) // _FOLDS)) % _FOLDS
     excess = [SliceHull(_hull(d[blocks != k], closed_mm)).signed_distance(d[blocks == k]) for k in range(_FOLDS)]

@@ -188,11 +188,9 @@ def missing_movements(d: Array, shown: Mask) -> list[str]:
 
 
 def bound_not_reached(gaps: tuple[Array, Array], shares: tuple[float, float]) -> list[str]:
-    """Return a sentence for each plane in which too large a fraction of the bound is far from all captured poses.
+    """Return a sentence for each plane in which too large a share of the bound is far from all captured poses.
 
-    Args:
-        gaps: points (d1, d2) and (d1, d3) in gaps [mm], each (G, 2).
-        shares: fraction of the points of the bound that lie in gaps, for each plane.
+    The gaps of each plane are points (d1, d2) and (d1, d3) [mm], (G, 2).
     """
     found = []
     for name, far, places, share in zip(PARAMETERS[1:], FAR_MM[1:], gaps, shares, strict=True):

@@ -54,11 +54,7 @@ class SubjectAnatomy:
         mandible_vertices: ArrayLike | None,
         T_rest: ArrayLike | None,
     ) -> SubjectAnatomy:
-        """Check the arrays; by default, the points are the landmarks and the closed bite is the identity.
-
-        Raises:
-            ValueError: an array has a wrong shape or is not finite.
-        """
+        """Check the arrays or raise ValueError; default: points are the landmarks, the closed bite is the identity."""
         landmarks = _array(landmarks, (len(LANDMARKS), 3), "landmarks")
         vertices = landmarks if mandible_vertices is None else mandible_vertices
         return cls(

@@ -73,10 +73,8 @@ def incisal_error(rig: JawRig, found: Array, d: Array) -> float:
 def check_jaw_weights(rig: JawRig, weights: Array, d: Array, error_mm: float) -> None:
     """Check that a take exercises every direction, and that learning from its weights improves on fixed fractions.
 
-    Args:
-        weights: the four ARKit jaw weights, NaN without a face, shape (N, 4).
-        d: jaw parameters of the same frames [mm], shape (N, 3).
-        error_mm: held-out error of the learned jaw at the incisal point.
+    The four ARKit jaw weights (N, 4), NaN without a face, and d (N, 3) [mm] are of the same frames; the learned jaw has
+    a held-out error [mm] at the incisal point.
 
     Raises:
         FittingError: a direction is not exercised, a weight is constant, or fixed fractions of the ranges are as
@@ -123,11 +121,7 @@ def blocks_of(count: int) -> list[Indices]:
 
 
 def check_motion(flat: Array, d: Array, sigma: Array) -> None:
-    """Check that columns of the face (M, K) and d (M, 3) [mm] vary enough to learn every parameter.
-
-    Raises:
-        FittingError: a parameter or the face hardly moves, or a standard deviation is not positive.
-    """
+    """Raise FittingError if columns of the face (M, K) or d (M, 3) [mm] hardly move, or sigma is not positive."""
     moved = d.std(axis=0)
     least = int(np.argmin(moved))
     if moved[least] < _LEAST_MOVED_MM:
@@ -145,10 +139,7 @@ def check_motion(flat: Array, d: Array, sigma: Array) -> None:
 def held_out_errors(rig: JawRig, held_out: Array, d: Array, blocks: list[Indices], X: Array) -> dict[str, float]:
     """Return the mean errors at the incisal point [mm] of held-out predictions and of baselines; see `fit_skin`.
 
-    Args:
-        held_out: d (M, 3) predicted for each block from the others [mm].
-        d: measured d (M, 3) [mm].
-        X: points (M, N, 3) [mm] or columns (M, K) of these frames.
+    Predicted and measured d are (M, 3) [mm], X are the points (M, N, 3) [mm] or columns (M, K) of the same frames.
     """
     guesses = {"skin": held_out, "carried": _carried(d, blocks), "mean": np.broadcast_to(d.mean(axis=0), d.shape)}
     if X.ndim == 3 and X.shape[1] >= _CHIN_POINTS:
@@ -194,11 +185,9 @@ def _of_chin(rig: JawRig, X: Array, d: Array, blocks: list[Indices]) -> Array:
 
 
 def on_bone(rig: JawRig, X: Array, poses: Array) -> tuple[Array, Array, Indices]:
-    """Fit points (F, N, 3) to the bone as if rigid with it.
+    """Fit points (F, N, 3) as if rigid with the bone; return T_skull_face (4, 4) and the three points that fit best.
 
-    Returns:
-        T_skull_face (4, 4), and for the points with the least residual their positions in the mandible (3, 3) and
-        their indices.
+    These are given by their positions in the mandible (3, 3) [mm] and their indices.
     """
     swing = transform_points(poses, rig.landmarks[:1])[:, 0]
     moved = X.mean(axis=1)

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import os
 from typing import NamedTuple
 
 import numpy as np
 
 from jawusd.base.arrays import Array
-from jawusd.base.errors import FormatError
+from jawusd.base.errors import AnyPath, FormatError
 from jawusd.evaluator import JawRig
 from jawusd.evaluator.verdicts import Verdicts
 from jawusd.formats.alignment import Alignment, motion_of_points, read_jaw_track
@@ -30,7 +29,7 @@ class JudgedFace(NamedTuple):
 
 def judge_jaw_track(
     rig: JawRig,
-    path: str | os.PathLike[str],
+    path: AnyPath,
     alignment: Alignment,
     residual_mm: float | None = None,
     tolerance_mm: float | None = None,
@@ -77,7 +76,7 @@ def alignment_error_mm(rig: JawRig, T_skull_mandible: Array, alignment: Alignmen
     return np.sqrt(squared)
 
 
-def save_verdicts(path: str | os.PathLike[str], judged: JudgedFace) -> None:
+def save_verdicts(path: AnyPath, judged: JudgedFace) -> None:
     """Write the verdicts as CSV, atomically; raises OutputError if that fails."""
     lines = ["frame,valid,verdict,residual_mm,margin_mm,d1,d2,d3,alignment_mm"]
     v = judged.verdicts

@@ -225,9 +225,7 @@ def unseen_errors(
 ) -> tuple[ErrorTable, dict[str, dict[str, float]], Array]:
     """Cross-validate: hold out contiguous parts of a take in turn, refit, and measure the error on the held-out parts.
 
-    Args:
-        form: the fit to all frames; only the errors of frames that it did not trim count.
-        notify: called with the index of each part before it is processed.
+    Only frames that the fit to all frames did not trim count; `notify` gets the index of each part before its turn.
 
     Returns:
         The error table; the growth of the errors away from the training poses, for each landmark and the mandible, as

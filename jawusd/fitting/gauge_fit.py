@@ -88,13 +88,10 @@ def _robust_fit(basis: Array, values: Array, weights: Array) -> Array:
 
 
 def fit_gauge(u: Array, weights: Array, path: Gauge, shown: Mask) -> GaugeFit:
-    """Fit gothic arch and glide surface to incisal displacements u (N, 3) [mm].
+    """Fit gothic arch and glide surface to incisal displacements u (N, 3) [mm], for the parameters shown (3,) by them.
 
     The stiffness is increased until the gauge is invertible. If none suffices, the gauge is that of the habitual path
     alone, which is always invertible.
-
-    Args:
-        shown: which of opening, laterotrusion and protrusion the data excite, shape (3,).
     """
     for stiffness in _STIFFNESSES:
         gauge = path

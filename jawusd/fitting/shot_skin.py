@@ -47,15 +47,12 @@ _MEDIAN_SQUARE = 0.455  # median of the square of a standard normal variable
 
 
 def in_head(points: Array, T_world_head: Array, seen: Mask) -> Array:
-    """Return the points in the skull frame.
+    """Return points on the skin, in the world, as points (F, M, 3) [mm] in the skull frame; NaN if too few are found.
 
     Args:
         points: points on the skin in the world [mm], NaN where they are not found, shape (F, N, 3).
         T_world_head: poses of the head, correct where the teeth are visible, shape (F, 4, 4).
         seen: frames in which the teeth are visible, shape (F,).
-
-    Returns:
-        Points (F, M, 3) [mm] in the skull frame; NaN where they or too few points on the head are found.
 
     Raises:
         FittingError: too few points are found, or too few of them follow the head.
@@ -203,15 +200,10 @@ class PointModel:
         return found
 
     def jaw(self, X: Array, departures: Array | float = 0.0) -> tuple[Array, Array, Array]:
-        """Return d of frames from their points.
+        """Return d (F, 3) [mm] of points (F, N, 3) [mm], covariances (F, 3, 3) [mm^2], and what the terms in d leave.
 
-        Args:
-            X: points (F, N, 3) [mm], NaN where they are not found.
-            departures: additional variances of the points (N,) [mm^2].
-
-        Returns:
-            d (F, 3) [mm] and its covariances (F, 3, 3) [mm^2], NaN where too few points are found; and what the terms
-            in d leave of the points, shape (F, N, 3) [mm].
+        Points are NaN where they are not found, d where too few are; `departures` (N,) are additional variances of
+        points [mm^2]. The third result has the shape of the points [mm].
         """
         moved = (X - self._mean).reshape(len(X), -1)
         known, moved = np.isfinite(moved), np.nan_to_num(moved)

@@ -7,14 +7,13 @@ covariances.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from jawusd.base.arrays import Array, Indices
-from jawusd.base.errors import FittingError
+from jawusd.base.errors import AnyPath, FittingError
 from jawusd.evaluator import JawRig
 from jawusd.evaluator.skin import FAMILY, VERSION, Skin, components, skin_kernel
 from jawusd.fitting import face
@@ -100,16 +99,13 @@ def fit_skin(
 
 
 def clock_offset(face_s: Array, X: Array, times_s: Array, d: Array) -> float:
-    """Return the clock offset [s] between face and jaw data at which the face best explains opening and laterotrusion.
+    """Return the offset [s], to be added to times of the face, at which it best explains opening and laterotrusion.
 
     Args:
         face_s: times of the face data [s], shape (F,).
         X: columns of the face data, NaN where hidden, shape (F, K).
         times_s: times of the jaw data [s], shape (N,).
         d: jaw parameters [mm], all known, shape (N, 3).
-
-    Returns:
-        Offset to be added to the times of the face data.
 
     Raises:
         FittingError: the takes are too short, or do not match at any offset.
@@ -141,7 +137,7 @@ def _explained(f: Array, d: Array) -> float:
     return float((1 - face.unexplained(f[rows], d[rows]).var(axis=0) / d[rows].var(axis=0)).min())
 
 
-def save_skin(path: str | os.PathLike[str], skin: Skin) -> None:
+def save_skin(path: AnyPath, skin: Skin) -> None:
     """Write a map of format jawusd-skin/1 atomically; raises OutputError if that fails."""
     write_described_npz(path, f"{FAMILY}/{VERSION}", skin.arrays, skin.meta)
 

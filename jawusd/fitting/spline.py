@@ -74,11 +74,9 @@ def ridge_solve(normal: Array, right: Array, penalty: Array) -> Array:
 
 
 def within(residual_mm: Array, trim_mad: float, floor_mm: float) -> Mask:
-    """Return which residuals (N,) exceed the median by no more than `trim_mad` normalised median absolute deviations.
+    """Return which residuals (N,) [mm] exceed the median by at most `trim_mad` deviations, or stay below a floor.
 
-    Args:
-        trim_mad: number of deviations (1.4826 MAD, the standard deviation of a normal distribution).
-        floor_mm: residuals up to this are never trimmed.
+    A deviation is 1.4826 times the median absolute deviation, the standard deviation of a normal distribution.
     """
     middle = float(np.median(residual_mm))
     spread = 1.4826 * float(np.median(np.abs(residual_mm - middle)))

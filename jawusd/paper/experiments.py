@@ -17,7 +17,7 @@ from jawusd.base.arrays import Array, Mask
 from jawusd.base.errors import FittingError
 from jawusd.evaluator.bounds import PolygonBound, SliceHull
 from jawusd.evaluator.encoding import vector_images
-from jawusd.fitting.bounds import PLANES, alpha_shapes, fit_slice_hull, valid_box
+from jawusd.fitting.bounds import PLANES, fit_bounds
 from jawusd.fitting.checks import FAR_MM, bound_not_reached, missing_movements, shown_parameters
 from jawusd.fitting.data import FittedForm, Source, SubjectAnatomy, TrainingData, select
 from jawusd.fitting.fit import FORMS, FittingConfig, Progress, one_blas_thread
@@ -51,12 +51,9 @@ class Bounds:
     @classmethod
     def of(cls, d: Array, alpha: float) -> Bounds:
         """Build the bounds of captured parameters d (N, 3) [mm]; `alpha` as in `FittingConfig`."""
-        shapes = alpha_shapes(d, alpha)
-        lateral, protrusive = (tuple(np.split(shapes[name], shapes[f"{name}_counts"].cumsum()[:-1])) for name in PLANES)
-        hull, _ = fit_slice_hull(d)
-        box = np.stack([d.min(0), d.max(0)], axis=1)
-        polygons = PolygonBound(shapes)
-        return cls(box, polygons, (lateral, protrusive), SliceHull(hull), valid_box(hull))
+        arrays, box = fit_bounds(d, alpha), np.stack([d.min(0), d.max(0)], axis=1)
+        lateral, protrusive = (tuple(np.split(arrays[name], arrays[f"{name}_counts"].cumsum()[:-1])) for name in PLANES)
+        return cls(box, PolygonBound(arrays), (lateral, protrusive), SliceHull(arrays), arrays["d_range"])
 
     def draw(self, rng: np.random.Generator) -> dict[str, Array]:
         """Return up to `POSES` uniformly distributed parameters (n, 3) [mm] within each bound, keyed by its name."""
