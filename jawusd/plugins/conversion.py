@@ -9,7 +9,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from jawusd.base.errors import FormatError, MissingDependencyError
+from jawusd.base.errors import AnyPath, FormatError, MissingDependencyError
 from jawusd.base.inputs import check_input
 from jawusd.formats.gltf import frame_rate
 
@@ -22,7 +22,7 @@ _SCRIPT = Path(__file__).with_name("blender_convert.py")
 _TIMEOUT_S = 900
 
 
-def converted(path: str | os.PathLike[str], folder: str | os.PathLike[str], fps: float) -> Path:
+def converted(path: AnyPath, folder: AnyPath, fps: float) -> Path:
     """Convert an .fbx, .glb or .gltf file to a USD stage in a folder; time 0 becomes frame 0.
 
     `fps` is the frame rate for files that do not contain one, such as glTF files of other programs.

@@ -15,7 +15,8 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 _ROOT = Path(__file__).parents[1]
-_OURS = re.compile(r"^(\s*)from jawusd((?:\.\w+)*) import", re.MULTILINE)
+_OURS = re.compile(r"^(\s*)from jawusd((?:\.\w+)+) import", re.MULTILINE)
+_WHOLE = re.compile(r"^\s*import .*\bjawusd\b.*$", re.MULTILINE)
 _VERSION = re.compile(r"^__version__ = .*$", re.MULTILINE)
 
 
@@ -33,40 +34,37 @@ def vendored_files(stubs: Iterable[Path]) -> dict[str, str]:
     for stub in stubs:
         text = stub.read_text(encoding="utf-8")
         _collect_imported(ast.parse(text), sources)
-        files[stub.with_suffix(".py").name] = _OURS.sub(r"\1from .jawusd\2 import", text)
+        files[stub.with_suffix(".py").name] = _with_imports_from(".jawusd", text)
     for module, source in sources.items():
-        files[_name(module)] = _relative(module, source)
+        files[_name(module)] = _with_imports_from("." * (_name(module).count("/") - 1), source)
         for parent in _parents(module):
             files.setdefault(_name(parent), "")
     return files
 
 
 def _collect_imported(tree: ast.Module, sources: dict[str, str]) -> None:
-    """Add the modules of jawusd that a module imports, recursively."""
+    """Add the modules of jawusd that a module imports, recursively, each after those that it imports."""
     for module in _imported(tree):
-        if module == "jawusd" or module in sources:
-            continue
-        sources[module] = _file(module).read_text(encoding="utf-8")
-        _collect_imported(ast.parse(sources[module]), sources)
+        if module != "jawusd" and module not in sources:
+            sources[module] = _file(module).read_text(encoding="utf-8")
+            _collect_imported(ast.parse(sources[module]), sources)
+            sources[module] = sources.pop(module)
 
 
 def _imported(tree: ast.Module) -> Iterator[str]:
     for node in ast.walk(tree):
-        if isinstance(node, ast.Import):
-            if any(alias.name.split(".")[0] == "jawusd" for alias in node.names):
-                raise ValueError(f"line {node.lineno}: {ast.unparse(node)!r} cannot be vendored")
-        elif isinstance(node, ast.ImportFrom) and str(node.module).split(".")[0] == "jawusd":
+        if isinstance(node, ast.ImportFrom) and str(node.module).split(".")[0] == "jawusd":
             for alias in node.names:
                 submodule = f"{node.module}.{alias.name}"
                 is_module = _file(submodule).is_file() and _file(submodule).stem != "__init__"
                 yield submodule if is_module else str(node.module)
 
 
-def _relative(module: str, source: str) -> str:
-    """Return the source of a module with its imports from jawusd made relative."""
-    parts = module.split(".")[1:]
-    dots = "." * (len(parts) + (_file(module).name == "__init__.py"))
-    return _OURS.sub(lambda found: f"{found[1]}from {dots}{found[2][1:]} import", source)
+def _with_imports_from(package: str, source: str) -> str:
+    """Return the source of a module with its imports from jawusd replaced by those from a relative package."""
+    if found := _WHOLE.search(source):
+        raise ValueError(f"{found[0].strip()!r} cannot be vendored")
+    return _OURS.sub(lambda found: f"{found[1]}from {package}{found[2]} import", source)
 
 
 def _file(module: str) -> Path:
@@ -126,50 +124,42 @@ def packed_reader() -> str:
     Raises:
         ValueError: A module has an unsupported import, or two modules define the same name.
     """
-    modules: dict[Path, ast.Module] = {}
-    _collect(_HERE / _READER, modules)
+    sources: dict[str, str] = {}
+    reader = (_HERE / _READER).read_text(encoding="utf-8")
+    _collect_imported(ast.parse(reader), sources)
     imported: dict[str, set[str]] = {}
-    defined: dict[str, Path] = {}
+    defined: dict[str, str] = {}
     bodies = []
-    for source, tree in modules.items():
+    for module, source in {**sources, "the reader": reader}.items():
+        tree = ast.parse(source)
         for name in _defined_names(tree):
-            if defined.setdefault(name, source) != source:
-                raise ValueError(f"{name} is defined in {defined[name].name} and in {source.name}")
-        bodies.append(_body(source, tree, imported))
+            if defined.setdefault(name, module) != module:
+                raise ValueError(f"{name} is defined in {defined[name]} and in {module}")
+        bodies.append(_body(module, source, tree, imported))
     header = [f"import {name}" for name, names in imported.items() if not names]
     header += [f"from {name} import {', '.join(sorted(names))}" for name, names in imported.items() if names]
-    docstring = ast.get_docstring(modules[_HERE / _READER], clean=False)
-    start = f'"""{docstring}"""\n\nfrom __future__ import annotations\n\n' + "\n".join(sorted(header))
+    start = f'"""{ast.get_docstring(tree, clean=False)}"""\n\nfrom __future__ import annotations\n\n' + "\n".join(
+        sorted(header)
+    )
     return "\n\n\n".join([start, *bodies]) + "\n"
 
 
-def _collect(source: Path, modules: dict[Path, ast.Module]) -> None:
-    """Parse a module and the jawusd modules that it imports; dependencies come first."""
-    tree = ast.parse(source.read_text(encoding="utf-8"))
-    for node in tree.body:
-        if isinstance(node, ast.ImportFrom) and str(node.module).startswith("jawusd."):
-            needed = _HERE.parent.joinpath(*str(node.module).split(".")[1:]).with_suffix(".py")
-            if needed not in modules:
-                _collect(needed, modules)
-    modules[source] = tree
-
-
-def _body(source: Path, tree: ast.Module, imported: dict[str, set[str]]) -> str:
+def _body(module: str, source: str, tree: ast.Module, imported: dict[str, set[str]]) -> str:
     """Return a module without docstring and imports; add imports from the standard library to `imported`."""
-    lines: list[str | None] = [*source.read_text(encoding="utf-8").splitlines()]
+    lines: list[str | None] = [*source.splitlines()]
     for node in ast.walk(tree):
         if isinstance(node, (ast.Import, ast.ImportFrom)) and node not in tree.body and "jawusd" in ast.unparse(node):
-            raise ValueError(f"{source.name}, line {node.lineno}: only imports at the top of a module can be packed")
+            raise ValueError(f"{module}, line {node.lineno}: only imports at the top of a module can be packed")
     dropped = [node for node in tree.body if isinstance(node, (ast.Import, ast.ImportFrom))]
     for node in dropped:
-        _add_import(source, node, imported)
+        _add_import(module, node, imported)
     docstring = tree.body[0] if ast.get_docstring(tree) else None
     for node in (*dropped, *([docstring] if docstring else [])):
         lines[node.lineno - 1 : node.end_lineno] = [None] * (int(node.end_lineno or node.lineno) - node.lineno + 1)
     return "\n".join(line for line in lines if line is not None).strip()
 
 
-def _add_import(source: Path, node: ast.Import | ast.ImportFrom, imported: dict[str, set[str]]) -> None:
+def _add_import(source: str, node: ast.Import | ast.ImportFrom, imported: dict[str, set[str]]) -> None:
     """Add an import from the standard library to the header of the packed file."""
     names = {alias.name for alias in node.names}
     modules = [str(node.module)] if isinstance(node, ast.ImportFrom) else sorted(names)
@@ -178,7 +168,7 @@ def _add_import(source: Path, node: ast.Import | ast.ImportFrom, imported: dict[
     for module in modules:
         top = module.split(".")[0]
         if renamed or relative or top not in {*sys.stdlib_module_names, "jawusd"} or module == "jawusd":
-            raise ValueError(f"{source.name}, line {node.lineno}: {ast.unparse(node)!r} cannot be packed")
+            raise ValueError(f"{source}, line {node.lineno}: {ast.unparse(node)!r} cannot be packed")
         if top != "jawusd" and module != "__future__":
             imported.setdefault(module, set()).update(names if isinstance(node, ast.ImportFrom) else ())
 
