@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from math import factorial
 
@@ -25,6 +25,11 @@ _SERIES_BELOW_RAD2 = 0.25
 FloatType = type[np.float32] | type[np.float64]
 
 
+def _operator(kind: str, *, swapped: bool = False) -> Callable[[Value, Value | float], Value]:
+    """Return the method of a binary operator, by default with the value on the left."""
+    return lambda value, other: value.graph.op(kind, *((other, value) if swapped else (value, other)))
+
+
 @dataclass(frozen=True)
 class Value:
     """A value in a graph: a column (n, 1), or an array of m columns (n, m); see `jawusd.evaluator.operations`."""
@@ -32,26 +37,10 @@ class Value:
     graph: Graph = field(repr=False)
     name: str
 
-    def __add__(self, other: Value | float) -> Value:
-        return self.graph.op("Add", self, other)
-
-    def __radd__(self, other: float) -> Value:
-        return self.graph.op("Add", other, self)
-
-    def __sub__(self, other: Value | float) -> Value:
-        return self.graph.op("Sub", self, other)
-
-    def __rsub__(self, other: float) -> Value:
-        return self.graph.op("Sub", other, self)
-
-    def __mul__(self, other: Value | float) -> Value:
-        return self.graph.op("Mul", self, other)
-
-    def __rmul__(self, other: float) -> Value:
-        return self.graph.op("Mul", other, self)
-
-    def __truediv__(self, other: Value | float) -> Value:
-        return self.graph.op("Div", self, other)
+    __add__, __radd__ = _operator("Add"), _operator("Add", swapped=True)
+    __sub__, __rsub__ = _operator("Sub"), _operator("Sub", swapped=True)
+    __mul__, __rmul__ = _operator("Mul"), _operator("Mul", swapped=True)
+    __truediv__ = _operator("Div")
 
     def __neg__(self) -> Value:
         return self.graph.op("Mul", self, -1.0)
