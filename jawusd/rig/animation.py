@@ -6,7 +6,6 @@ shear when interpolated, and a product of one transform per parameter would be w
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -15,7 +14,7 @@ from numpy.typing import ArrayLike
 from pxr import Gf, Sdf, Ts
 
 from jawusd.base.arrays import Array, Mask
-from jawusd.base.errors import RigError
+from jawusd.base.errors import AnyPath, RigError
 from jawusd.evaluator import JawRig
 from jawusd.evaluator.curves import interpolate_linear
 from jawusd.geometry.se3 import make_transform
@@ -42,8 +41,8 @@ SKIN = "skinFrames"
 
 
 def write_animation(
-    out: str | os.PathLike[str],
-    actor: str | os.PathLike[str],
+    out: AnyPath,
+    actor: AnyPath,
     frames: ArrayLike,
     d: ArrayLike,
     fps: float,
@@ -110,11 +109,7 @@ def note_unseen(layer: Sdf.Layer, carried: ArrayLike, by_skin: ArrayLike, lost: 
 
 
 def root_prim_of(actor: Path) -> str:
-    """Return the name of the root prim with the rig in an actor's file.
-
-    Raises:
-        RigError: There is not exactly one root prim that is a rig.
-    """
+    """Return the name of the rig's root prim in an actor's file; raise RigError if not exactly one is a rig."""
     stage = open_stage(actor)
     names = [prim.GetName() for prim in rig_prims(stage) if prim.GetPath().IsRootPrimPath()]
     if len(names) != 1:
@@ -202,8 +197,8 @@ def _as_shown_by_usd(T_a: Array, T_b: Array, share: float) -> Array:
 
 
 def write_splines(
-    out: str | os.PathLike[str],
-    animation: str | os.PathLike[str],
+    out: AnyPath,
+    animation: AnyPath,
     frames: ArrayLike,
     d: ArrayLike,
     fps: float,

@@ -128,11 +128,7 @@ def recorded_checksums(layer: Sdf.Layer) -> dict[Path, str]:
 
 
 def check_checksum(file: Path, wanted: str) -> None:
-    """Compare a file with its checksum.
-
-    Raises:
-        RigError: The checksum does not match.
-    """
+    """Raise RigError if the checksum of a file is not the wanted one."""
     if sha256_of(file) != wanted:
         raise RigError(
             "is damaged, or was changed after the rig was written: its checksum differs from the one in the rig.",

@@ -50,57 +50,43 @@ def write_arrays(prim: Sdf.PrimSpec, rig: JawRig, prefixes: tuple[str, ...]) -> 
             set_attribute(prim, spec.attribute, _TYPES.Double, float(value))
 
 
-def read_arrays(prim: Usd.Prim, kind: str, where: object) -> dict[str, Array]:
-    """Return all model arrays of a rig prim by name.
-
-    Raises:
-        FormatError: An attribute is missing, is not an array of numbers, or has the wrong length.
-    """
+def read_arrays(prim: Usd.Prim, kind: str) -> dict[str, Array]:
+    """Return all model arrays of a rig prim by name; raise FormatError for missing, wrong or too short ones."""
     arrays: dict[str, Array] = {}
     lengths: dict[str, int] = {}
     authored = present_arrays(kind, lambda _, spec: prim.GetAttribute(spec.attribute or "").HasAuthoredValue())
     for name, spec in authored.items():
         if spec.attribute is None:
-            ranges = [read_value(prim, attribute, where) for attribute in D_RANGE_ATTRIBUTES]
+            ranges = [read_value(prim, attribute) for attribute in D_RANGE_ATTRIBUTES]
             arrays[name] = np.array(ranges, dtype=np.float64)
             continue
-        value = np.array(read_value(prim, spec.attribute, where))
+        value = np.array(read_value(prim, spec.attribute))
         if value.dtype.kind not in "fiu" or value.ndim > 1:
-            raise FormatError(f"{spec.attribute} is not a flat array of numbers.", path=str(where))
+            raise FormatError(f"{spec.attribute} is not a flat array of numbers.")
         shape = [lengths.get(n, -1) if isinstance(n, str) else n for n in spec.shape]
         try:
             arrays[name] = value.astype(np.float64).reshape(shape)
         except ValueError as error:
             expected = "(" + ", ".join(str(n) for n in spec.shape) + ")"
-            message = f"{spec.attribute} has {value.size} numbers, expected shape {expected}."
-            raise FormatError(message, path=str(where)) from error
+            raise FormatError(f"{spec.attribute} has {value.size} numbers, expected shape {expected}.") from error
         lengths.update((n, found) for n, found in zip(spec.shape, arrays[name].shape) if isinstance(n, str))
     return arrays
 
 
-def read_value(prim: Usd.Prim, name: str, where: object) -> object:
-    """Return the default value of an attribute.
-
-    Raises:
-        FormatError: The attribute has no value, or too many numbers.
-    """
+def read_value(prim: Usd.Prim, name: str) -> object:
+    """Return the default value of an attribute; raise FormatError if there is none, or too many numbers."""
     attribute = prim.GetAttribute(name)
-    value = value_of(attribute, where) if attribute else None
+    value = value_of(attribute) if attribute else None
     if value is None:
-        raise FormatError(f"{prim.GetPath()} has no value for {name}; the jaw rig is incomplete.", path=str(where))
+        raise FormatError(f"{prim.GetPath()} has no value for {name}; the jaw rig is incomplete.")
     return value
 
 
-def value_of(attribute: Usd.Attribute, where: object, time: Usd.TimeCode | None = None) -> object:
-    """Return the value of an attribute at a time, or its default value; None if there is none.
-
-    Raises:
-        FormatError: The value is an array of more than `MAX_VALUES` elements.
-    """
+def value_of(attribute: Usd.Attribute, time: Usd.TimeCode | None = None) -> object:
+    """Return the value of an attribute at a time, by default its default; raise FormatError for over `MAX_VALUES`."""
     value = attribute.Get(Usd.TimeCode.Default() if time is None else time)
     if hasattr(value, "__len__") and len(value) > MAX_VALUES:
-        found = f"{attribute.GetPath()} has {len(value)} values, more than the limit of {MAX_VALUES}."
-        raise FormatError(found, path=str(where))
+        raise FormatError(f"{attribute.GetPath()} has {len(value)} values, more than the limit of {MAX_VALUES}.")
     return value
 
 
@@ -153,9 +139,9 @@ def time_codes(times: Array) -> list[Usd.TimeCode]:
 
 def _upgrade_1_to_2(prim: Usd.Prim) -> None:
     """Derive the tolerance of measured poses; format version 1 stored the smallest valid margin instead."""
-    limit = read_value(prim, "jaw:thresholds:margin", prim.GetStage().GetRootLayer().identifier)
+    limit = read_value(prim, "jaw:thresholds:margin")
     if not isinstance(limit, float):
-        raise FormatError(f"jaw:thresholds:margin is {limit!r}; expected a number.", path=str(prim.GetPath()))
+        raise FormatError(f"jaw:thresholds:margin is {limit!r}; expected a number.")
     tolerance = prim.CreateAttribute("jaw:thresholds:tolerance", Sdf.ValueTypeNames.Double)
     tolerance.Set(-limit)
 
@@ -163,20 +149,19 @@ def _upgrade_1_to_2(prim: Usd.Prim) -> None:
 UPGRADES: dict[int, Callable[[Usd.Prim], None]] = {1: _upgrade_1_to_2}
 
 
-def upgrade_rig(prim: Usd.Prim, where: object) -> None:
+def upgrade_rig(prim: Usd.Prim) -> None:
     """Check the format version of a rig prim, and upgrade an older one in the session layer of the stage, in memory.
 
     Raises:
         FormatError: The version is not a positive integer.
         VersionError: The rig's format is newer than this version of jawusd supports.
     """
-    version = read_value(prim, "jaw:formatVersion", where)
+    version = read_value(prim, "jaw:formatVersion")
     if not isinstance(version, int) or version < 1:
-        raise FormatError(f"jaw:formatVersion is {version!r}; expected a positive integer.", path=str(where))
+        raise FormatError(f"jaw:formatVersion is {version!r}; expected a positive integer.")
     if version > FORMAT_VERSION:
         raise VersionError(
             f"the rig has format version {version}; this version of jawusd reads versions up to {FORMAT_VERSION}.",
-            path=str(where),
             hint="Update jawusd.",
         )
     stage = prim.GetStage()

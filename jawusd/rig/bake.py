@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pxr import Kind, Sdf, UsdGeom, Vt
+from pxr import Gf, Kind, Sdf, UsdGeom, Vt
 
 from jawusd.base.arrays import Array
-from jawusd.base.errors import RigError
+from jawusd.base.errors import AnyPath, RigError
 from jawusd.evaluator import JawRig
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry.anatomy import LANDMARKS
@@ -38,11 +37,7 @@ _DECODER_ARRAYS = ("jaw:model:", "jaw:bounds:", "jaw:contact:", "jaw:joints:", "
 def proxy_layer(
     proxies: Mapping[str, Mesh], meshes: Mapping[str, Mesh], T_rest: Array, estimate: Estimate | None
 ) -> Sdf.Layer:
-    """Build `proxy.usdc`, as `build_geometry` with proxies in place of some meshes, and a class that adds them.
-
-    Raises:
-        RigError: A mesh without faces or with values that are not finite.
-    """
+    """Build `proxy.usdc`, as `build_geometry` does with proxies in place of some meshes, and a class that adds them."""
     layer = build_geometry({**meshes, **proxies}, T_rest, estimate)
     _define_proxy_class(layer, proxies)
     stage = layers.stage_of(layer)
@@ -123,7 +118,7 @@ def interface_layer(
     layers.set_attribute(actor, "extentsHint", _TYPES.Float3Array, box, animated=True, custom=False)
     for parameter, limits in zip(layout.PARAMETERS, rig.d_range, strict=True):
         layers.set_attribute(actor, parameter, _TYPES.Double, 0.0, animated=True)
-        layers.set_attribute(actor, f"{parameter}:range", _TYPES.Double2, layers.vec2d(limits))
+        layers.set_attribute(actor, f"{parameter}:range", _TYPES.Double2, Gf.Vec2d(*limits.tolist()))
     layers.set_attribute(actor, "jaw:formatVersion", _TYPES.Int, layout.FORMAT_VERSION)
     layers.set_attribute(actor, "jaw:actor", _TYPES.String, name)
     layers.set_attribute(actor, "jaw:lengthUnit", _TYPES.Token, "mm")
@@ -177,7 +172,7 @@ def motion_extent(rig: JawRig, meshes: Mapping[str, Mesh]) -> Array:
 
 
 def bake_rig(
-    folder: str | os.PathLike[str],
+    folder: AnyPath,
     rig: JawRig,
     meshes: Mapping[str, Mesh],
     *,

@@ -5,7 +5,6 @@ Cameras alone are also written and read, to exchange calibrations with other pro
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Container, Mapping, Sequence
 from pathlib import Path
 
@@ -14,7 +13,7 @@ from numpy.typing import ArrayLike
 from pxr import Gf, Kind, Sdf, Usd, UsdGeom
 
 from jawusd.base.arrays import Array
-from jawusd.base.errors import CalibrationError, RigError, naming_file
+from jawusd.base.errors import AnyPath, CalibrationError, RigError
 from jawusd.cameras.files import names_of_labels
 from jawusd.geometry.camera import Camera
 from jawusd.geometry.se3 import make_transform, se3_inverse
@@ -41,9 +40,9 @@ _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 def write_cameras(
-    out: str | os.PathLike[str],
+    out: AnyPath,
     cameras: Sequence[Camera],
-    actor: str | os.PathLike[str],
+    actor: AnyPath,
     frames: ArrayLike,
     T_world_skull: ArrayLike,
     fps: float,
@@ -124,7 +123,7 @@ def _motion_layer(actor_path: str, frames: Array, T_world_skull: Array, fps: flo
     return layer
 
 
-def write_camera_stage(out: str | os.PathLike[str], cameras: Sequence[Camera]) -> Path:
+def write_camera_stage(out: AnyPath, cameras: Sequence[Camera]) -> Path:
     """Write calibrated cameras alone as a stage in mm, in the calibration's world; attributes as in `write_cameras`.
 
     Raises:
@@ -134,8 +133,8 @@ def write_camera_stage(out: str | os.PathLike[str], cameras: Sequence[Camera]) -
     return write_layer(_camera_layer(cameras, 24.0, (), Path(out)), Path(out))
 
 
-@raises_format_error(0)
-def read_cameras(path: str | os.PathLike[str], sizes: Callable[[], Mapping[str, tuple[int, int]]]) -> list[Camera]:
+@raises_format_error
+def read_cameras(path: AnyPath, sizes: Callable[[], Mapping[str, tuple[int, int]]]) -> list[Camera]:
     """Read the perspective cameras in a stage as OpenCV cameras in mm, named after their prims.
 
     Prims of equal names are named after their paths. The image spans the aperture, shifted by its offsets. Its size
@@ -155,7 +154,6 @@ def read_cameras(path: str | os.PathLike[str], sizes: Callable[[], Mapping[str, 
     if Path(path).suffix.lower() == ".abc" and Sdf.FileFormat.FindByExtension("abc") is None:
         raise RigError(
             "is an Alembic file; reading it needs OpenUSD's plugin usdAbc, which is not installed.",
-            path=path,
             hint="Export the cameras as USD from the program that wrote them (Blender, Houdini and Maya read Alembic "
             "and write USD), or use a build of OpenUSD with Alembic.",
         )
@@ -164,36 +162,33 @@ def read_cameras(path: str | os.PathLike[str], sizes: Callable[[], Mapping[str, 
     cameras = [prim for prim in stage.Traverse() if prim.IsA(UsdGeom.Camera)]
     # skips orthographic cameras, which are the top and side views of 3-D programs
     prims = [prim for prim in cameras if UsdGeom.Camera(prim).GetProjectionAttr().Get() != "orthographic"]
-    with naming_file(path):
-        names = names_of_labels([str(prim.GetPath())[1:] for prim in prims])
+    names = names_of_labels([str(prim.GetPath())[1:] for prim in prims])
     known: Mapping[str, tuple[int, int]] | None = None
     out = []
     for name, prim in zip(names, prims, strict=True):
-        _check_lens(path, prim)
+        _check_lens(prim)
         size = prim.GetAttribute("jaw:imageSize").Get() if prim.HasAttribute("jaw:imageSize") else None
         if size is None:
             known = sizes() if known is None else known
             if name not in known:
                 raise CalibrationError(
                     f"camera {name} has no jaw:imageSize, and there is no footage of that name.",
-                    path=path,
                     hint="Name each [[camera]] like the camera's prim, or give --size.",
                 )
             size = known[name]
         out.append(_read_camera(name, prim, (int(size[0]), int(size[1])), mm))
     if not out:
-        raise RigError("has no perspective camera.", path=path)
+        raise RigError("has no perspective camera.")
     return out
 
 
-def _check_lens(path: str | os.PathLike[str], prim: Usd.Prim) -> None:
+def _check_lens(prim: Usd.Prim) -> None:
     """Raise CalibrationError if a camera has one of Omniverse's lens models, such as fisheye."""
     for name in _LENS_MODELS:
         model = prim.GetAttribute(name).Get() if prim.HasAttribute(name) else None
         if model and str(model) != "pinhole":
             raise CalibrationError(
                 f"has {name} = {model}; only pinholes with OpenCV's coefficients in jaw:distortion can be read.",
-                path=path,
                 camera=prim.GetName(),
                 hint="Undistort the footage first, or export the camera as a pinhole.",
             )

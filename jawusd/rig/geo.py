@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdShade
 
 from jawusd.base.arrays import Array, Mask
-from jawusd.base.errors import RigError
+from jawusd.base.errors import AnyPath, RigError
 from jawusd.formats.mesh import Mesh, crown_face_mask, natural_colors, without_loose
 from jawusd.meshes import surfaces
 from jawusd.rig import layers
@@ -98,8 +96,7 @@ def build_geometry(meshes: Mapping[str, Mesh], T_rest: Array, estimate: Estimate
     """Build the layer with all meshes under /Actor.
 
     Args:
-        meshes: `upper_teeth` and `skull` in the skull frame, `lower_teeth` and `mandible` in the mandible frame [mm];
-            `skull` and `mandible` may be missing.
+        meshes: as in `bake_rig`, but `skull` and `mandible` may be missing [mm].
         T_rest: T_skull_mandible with the teeth closed, shape (4, 4): the mandible's default pose.
         estimate: The estimated bones among the meshes, which are marked as placeholders; None without any.
 
@@ -207,10 +204,8 @@ def vertex_normals(mesh: Mesh) -> Array:
     return np.where(np.linalg.norm(normals, axis=1, keepdims=True) > 0.5, normals, [0.0, 1.0, 0.0])
 
 
-@raises_format_error(0)
-def read_geometry(
-    path: str | os.PathLike[str], prim_path: str | None = None, *, placeholders: bool = False
-) -> dict[str, Mesh]:
+@raises_format_error
+def read_geometry(path: AnyPath, prim_path: str | None = None, *, placeholders: bool = False) -> dict[str, Mesh]:
     """Read the meshes of a rig by the names of `MESH_PATHS`: either scanned anatomy or placeholders.
 
     Skull and upper teeth are in the skull frame, mandible and lower teeth in the mandible frame [mm], in single
@@ -230,10 +225,10 @@ def read_geometry(
         mesh = UsdGeom.Mesh(stage.GetPrimAtPath(place))
         if not mesh or bool(mesh.GetPrim().GetAttribute("jaw:placeholder").Get()) != placeholders:
             continue
-        counts = np.array(value_of(mesh.GetFaceVertexCountsAttr(), path) or [])
+        counts = np.array(value_of(mesh.GetFaceVertexCountsAttr()) or [])
         if not counts.size or (counts != 3).any():
-            raise RigError(f"{place} has faces that are not triangles.", path=Path(path))
-        points, corners = (value_of(a, path) for a in (mesh.GetPointsAttr(), mesh.GetFaceVertexIndicesAttr()))
+            raise RigError(f"{place} has faces that are not triangles.")
+        points, corners = (value_of(a) for a in (mesh.GetPointsAttr(), mesh.GetFaceVertexIndicesAttr()))
         vertices = np.array(points, dtype=np.float64)
         faces = np.array(corners, dtype=np.int32).reshape(-1, 3)
         colors, uv = read_look(mesh, len(vertices), len(faces))
@@ -243,27 +238,23 @@ def read_geometry(
     return found
 
 
-@raises_format_error(0)
-def read_gum(path: str | os.PathLike[str], prim_path: str | None = None) -> dict[str, Mask]:
-    """Return masks of the gum faces (F,) of the teeth meshes with a gum subset, by the names of `MESH_PATHS`.
-
-    Raises:
-        RigError: The file is not USD.
-    """
+@raises_format_error
+def read_gum(path: AnyPath, prim_path: str | None = None) -> dict[str, Mask]:
+    """Return masks of gum faces (F,) of teeth meshes with a gum subset, by `MESH_PATHS`; raise RigError if not USD."""
     stage = open_stage(path)
     found = {}
     for name, place in _mesh_paths(stage, path, prim_path).items():
         mesh = UsdGeom.Mesh(stage.GetPrimAtPath(place))
         subset = UsdGeom.Subset(stage.GetPrimAtPath(f"{place}/{place.rsplit('/', 1)[1]}Gum"))
         if mesh and subset:
-            gum = np.zeros(np.size(np.array(value_of(mesh.GetFaceVertexCountsAttr(), path))), dtype=np.bool_)
-            gum[np.array(value_of(subset.GetIndicesAttr(), path))] = True
+            gum = np.zeros(np.size(np.array(value_of(mesh.GetFaceVertexCountsAttr()))), dtype=np.bool_)
+            gum[np.array(value_of(subset.GetIndicesAttr()))] = True
             found[name] = gum
     return found
 
 
-def _mesh_paths(stage: Usd.Stage, where: object, prim_path: str | None) -> dict[str, str]:
+def _mesh_paths(stage: Usd.Stage, path: AnyPath, prim_path: str | None) -> dict[str, str]:
     if prim_path is None:
         default = stage.GetDefaultPrim()
-        prim_path = str((default if default and not rig_prims(stage) else find_rig_prim(stage, where)).GetPath())
+        prim_path = str((default if default and not rig_prims(stage) else find_rig_prim(stage, path)).GetPath())
     return {name: prim_path + path.removeprefix(ACTOR) for name, path in MESH_PATHS.items()}

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jawusd.base.arrays import Array, Mask
-from jawusd.base.errors import RigError
+from jawusd.base.errors import AnyPath, RigError
 from jawusd.base.version import __version__
 from jawusd.evaluator import JawRig
 from jawusd.formats.gltf import Material, Node, Surface, save_glb
@@ -22,14 +21,7 @@ _HIGHEST_FRAME = 100_000.0  # largest frame number at which single precision res
 _SCAN = "Scan"  # name of the material of scans, which is white because vertex colours are multiplied by its colour
 
 
-def write_glb(
-    out: str | os.PathLike[str],
-    actor: str | os.PathLike[str],
-    rig: JawRig,
-    frames: ArrayLike,
-    d: ArrayLike,
-    fps: float,
-) -> Path:
+def write_glb(out: AnyPath, actor: AnyPath, rig: JawRig, frames: ArrayLike, d: ArrayLike, fps: float) -> Path:
     """Write the meshes of an actor and its motion in the skull frame; frame 0 is at 0 s (see `frame_at_zero`).
 
     The mandible has a key at every whole frame, and more where interpolation would deviate from the model. The

@@ -51,11 +51,6 @@ def vec2f_array(values: ArrayLike) -> Vt.Vec2fArray:
     return Vt.Vec2fArray.FromNumpy(np.ascontiguousarray(values, dtype=np.float32))
 
 
-def vec2d(pair: ArrayLike) -> Gf.Vec2d:
-    """Return two numbers as a Gf.Vec2d."""
-    return Gf.Vec2d(*np.asarray(pair, dtype=np.float64).tolist())
-
-
 def translations(T: ArrayLike) -> list[Gf.Vec3d]:
     """Return the translations [mm] of transforms (n, 4, 4)."""
     return [Gf.Vec3d(*t) for t in np.asarray(T, dtype=np.float64)[:, :3, 3].tolist()]
@@ -64,11 +59,6 @@ def translations(T: ArrayLike) -> list[Gf.Vec3d]:
 def rotations(T: ArrayLike) -> list[Gf.Quatd]:
     """Return the rotations of transforms (n, 4, 4) as unit quaternions without sign flips between neighbours."""
     return [Gf.Quatd(w, x, y, z) for w, x, y, z in continuous_wxyz(np.asarray(T)[:, :3, :3]).tolist()]
-
-
-def quatf_arrays(T: ArrayLike) -> list[Vt.QuatfArray]:
-    """Return the result of `rotations` as samples of a one-joint animation, each a Vt.QuatfArray of length one."""
-    return [Vt.QuatfArray([Gf.Quatf(w, x, y, z)]) for w, x, y, z in continuous_wxyz(np.asarray(T)[:, :3, :3]).tolist()]
 
 
 def row_matrix(T: ArrayLike) -> Gf.Matrix4d:
@@ -149,11 +139,7 @@ def _joint(joint: str, name: str, before: str) -> str:
 
 
 def stage_of(layer: Sdf.Layer) -> Usd.Stage:
-    """Return a stage whose root is an anonymous layer, for schema classes that need a stage.
-
-    Raises:
-        RigError: OpenUSD cannot open it.
-    """
+    """Return a stage whose root is an anonymous layer, for schema classes; raise RigError if OpenUSD cannot open it."""
     stage = Usd.Stage.Open(layer, load=Usd.Stage.LoadNone)
     if stage is None:
         raise RigError("OpenUSD could not open an anonymous layer.")

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pxr import Usd, UsdGeom
 
 from jawusd.base.arrays import Array
-from jawusd.base.errors import FormatError
+from jawusd.base.errors import AnyPath, FormatError
 from jawusd.evaluator import JawRig
 from jawusd.geometry.se3 import rigidity_defect
 from jawusd.rig.animation import BETWEEN_MM, LOST
@@ -26,8 +26,8 @@ BAKED_MM = 0.01
 _RIGID = 1e-5  # maximum rigidity defect; single-precision quaternions written by DCC programs stay below it
 
 
-@raises_format_error(0)
-def read_poses_of_stage(path: str | os.PathLike[str], prim_path: str | None = None) -> tuple[NDArray[np.int64], Array]:
+@raises_format_error
+def read_poses_of_stage(path: AnyPath, prim_path: str | None = None) -> tuple[NDArray[np.int64], Array]:
     """Read frame numbers (F,) and T_skull_mandible (F, 4, 4) [mm], relative to the actor, at whole frames of a stage.
 
     Raises:
@@ -36,11 +36,11 @@ def read_poses_of_stage(path: str | os.PathLike[str], prim_path: str | None = No
     """
     stage = open_stage(path)
     actor = find_rig_prim(stage, path, prim_path)
-    times = frames_of_stage(stage, path)
-    return times, poses_at(mandible_of(actor, path), actor, times, path)
+    times = frames_of_stage(stage)
+    return times, poses_at(mandible_of(actor), actor, times)
 
 
-def poses_at(mandible: Usd.Prim, actor: Usd.Prim, times: ArrayLike, path: object) -> Array:
+def poses_at(mandible: Usd.Prim, actor: Usd.Prim, times: ArrayLike) -> Array:
     """Return the poses T_skull_mandible (F, 4, 4) [mm] at times (F,), in the actor's units, from transforms or bones.
 
     Without times, the default time is read; without a skull, the poses are relative to the actor.
@@ -49,30 +49,25 @@ def poses_at(mandible: Usd.Prim, actor: Usd.Prim, times: ArrayLike, path: object
         FormatError: The motion is not rigid.
     """
     codes = time_codes(np.asarray(times, dtype=np.float64))
-    poses, skull = poses_in_actor(mandible, actor, codes, path), skull_of(actor, path)
+    poses, skull = poses_in_actor(mandible, actor, codes), skull_of(actor)
     if skull is not None:
-        poses = np.asarray(np.linalg.solve(poses_in_actor(skull, actor, codes, path), poses), np.float64)
+        poses = np.asarray(np.linalg.solve(poses_in_actor(skull, actor, codes), poses), np.float64)
     defect = rigidity_defect(poses)
     if not defect.max() <= _RIGID:
         worst = int(np.argmax(np.where(np.isfinite(defect), defect, np.inf)))
         raise FormatError(
             f"the mandible is not rigid at frame {codes[worst]}: "
             f"its deviation from a rigid transform is {defect[worst]:.2g}; the maximum is {_RIGID:g}.",
-            path=str(path),
             hint="Matrix samples shear when interpolated: key translate and orient instead.",
         )
     return poses
 
 
-def poses_in_actor(prim: Usd.Prim, actor: Usd.Prim, times: Sequence[Usd.TimeCode], path: object) -> Array:
-    """Return the transforms (F, 4, 4) from the frame of the meshes below a prim to the actor's frame.
-
-    Raises:
-        FormatError: Bones deform the meshes, or the meshes move differently.
-    """
+def poses_in_actor(prim: Usd.Prim, actor: Usd.Prim, times: Sequence[Usd.TimeCode]) -> Array:
+    """Return transforms (F, 4, 4) from the meshes below a prim to its actor; raise FormatError if deformed or apart."""
     bones = bones_of(prim)
     if bones is not None:
-        return bones.poses(actor, times, path)
+        return bones.poses(actor, times)
     movers = _moving_prims(prim)
     moved = np.empty((len(movers), len(times), 4, 4))
     for k, time in enumerate(times):
@@ -81,9 +76,7 @@ def poses_in_actor(prim: Usd.Prim, actor: Usd.Prim, times: Sequence[Usd.TimeCode
             moved[i, k] = np.array(transform_in_actor(actor, mover, cache)).T  # USD uses row vectors
     if not np.abs(moved - moved[:1]).max() <= SAME_MOTION:
         raise FormatError(
-            f"the meshes below {prim.GetPath()} move differently.",
-            path=str(path),
-            hint="Move the prim above them instead.",
+            f"the meshes below {prim.GetPath()} move differently.", hint="Move the prim above them instead."
         )
     first: Array = moved[0]
     return first
@@ -115,10 +108,8 @@ def _moving_prims(prim: Usd.Prim) -> list[Usd.Prim]:
     return meshes if is_transformed else [prim]
 
 
-@raises_format_error(0)
-def read_parameters_of_stage(
-    path: str | os.PathLike[str], prim_path: str | None = None
-) -> tuple[Array, Array, float] | None:
+@raises_format_error
+def read_parameters_of_stage(path: AnyPath, prim_path: str | None = None) -> tuple[Array, Array, float] | None:
     """Read the times (F,), the samples of d (F, 3) [mm] and the frame rate of an animation layer; NaN in lost frames.
 
     None if the motion is given by transforms only.
@@ -128,15 +119,11 @@ def read_parameters_of_stage(
         FormatError: No rig or several rigs, or parameters that are not finite.
     """
     stage = open_stage(path)
-    return parameters_of(find_rig_prim(stage, path, prim_path), path)
+    return parameters_of(find_rig_prim(stage, path, prim_path))
 
 
-def parameters_of(actor: Usd.Prim, path: object) -> tuple[Array, Array, float] | None:
-    """Read the samples of d of a rig prim, as `read_parameters_of_stage` does.
-
-    Raises:
-        FormatError: There are too many parameters, or some are not finite.
-    """
+def parameters_of(actor: Usd.Prim) -> tuple[Array, Array, float] | None:
+    """Read d of a rig prim as `read_parameters_of_stage` does; raise FormatError for too many or infinite samples."""
     stage = actor.GetStage()
     attributes = [actor.GetAttribute(name) for name in PARAMETERS]
     sampled = [key_times(attribute) for attribute in attributes if attribute]
@@ -144,10 +131,10 @@ def parameters_of(actor: Usd.Prim, path: object) -> tuple[Array, Array, float] |
     if len(sampled) < len(PARAMETERS) or not len(times):
         return None
     if len(times) > MAX_FRAMES:
-        raise FormatError(f"has {len(times)} samples of d; the maximum is {MAX_FRAMES}.", path=str(path))
+        raise FormatError(f"has {len(times)} samples of d; the maximum is {MAX_FRAMES}.")
     d = np.array([values_at(attribute, times.tolist()) for attribute in attributes], dtype=np.float64).T
     if not np.isfinite(d).all():
-        raise FormatError("its samples of d have values that are not finite.", path=str(path))
+        raise FormatError("its samples of d have values that are not finite.")
     listed = stage.GetRootLayer().customLayerData.get(LOST, [])
     lost = np.setdiff1d(np.array(list(listed), dtype=np.float64), times)
     order = np.argsort(np.concatenate([times, lost]))
@@ -155,34 +142,26 @@ def parameters_of(actor: Usd.Prim, path: object) -> tuple[Array, Array, float] |
     return np.concatenate([times, lost])[order], all_d[order], float(stage.GetTimeCodesPerSecond())
 
 
-def mandible_of(actor: Usd.Prim, path: object) -> Usd.Prim:
-    """Return the mandible prim of a rig.
-
-    Raises:
-        FormatError: jaw:mandible has not exactly one target, or its target is missing or cannot be moved.
-    """
-    return _relationship_target(actor, "jaw:mandible", path)
+def mandible_of(actor: Usd.Prim) -> Usd.Prim:
+    """Return the mandible prim of a rig; raise FormatError if jaw:mandible has no single target that can be moved."""
+    return _relationship_target(actor, "jaw:mandible")
 
 
-def skull_of(actor: Usd.Prim, path: object) -> Usd.Prim | None:
-    """Return the skull prim of a rig; None, for the actor's frame, if it is not set or inactive.
-
-    Raises:
-        FormatError: jaw:skull has several targets, or its target is missing.
-    """
+def skull_of(actor: Usd.Prim) -> Usd.Prim | None:
+    """Return the skull prim of a rig, None if unset or inactive; raise FormatError if missing or not the only one."""
     relationship = actor.GetRelationship("jaw:skull")
     targets = relationship.GetTargets() if relationship else []
     found = [actor.GetStage().GetPrimAtPath(target) for target in targets]
     if all(prim and not prim.IsActive() for prim in found):
         return None
-    return _relationship_target(actor, "jaw:skull", path)
+    return _relationship_target(actor, "jaw:skull")
 
 
-def _relationship_target(actor: Usd.Prim, name: str, path: object) -> Usd.Prim:
+def _relationship_target(actor: Usd.Prim, name: str) -> Usd.Prim:
     relationship, stage = actor.GetRelationship(name), actor.GetStage()
     targets = relationship.GetTargets() if relationship else []
     if len(targets) != 1:
-        raise FormatError(f"{name} of {actor.GetPath()} has {len(targets)} targets; expected 1.", path=str(path))
+        raise FormatError(f"{name} of {actor.GetPath()} has {len(targets)} targets; expected 1.")
     existing = [prim for prim in map(stage.GetPrimAtPath, targets[0].GetPrefixes()) if prim]
     prim = stage.GetPrimAtPath(targets[0])
     if existing and not existing[-1].IsActive():
@@ -195,19 +174,14 @@ def _relationship_target(actor: Usd.Prim, name: str, path: object) -> Usd.Prim:
         found = "it is not below the actor."
     else:
         return prim
-    raise FormatError(f"{name} targets {targets[0]}: {found}", path=str(path))
+    raise FormatError(f"{name} targets {targets[0]}: {found}")
 
 
-def frames_of_stage(stage: Usd.Stage, path: object) -> NDArray[np.int64]:
-    """Return the whole frames between start and end of a stage.
-
-    Raises:
-        FormatError: The stage has no time range, or one with too many frames.
-    """
+def frames_of_stage(stage: Usd.Stage) -> NDArray[np.int64]:
+    """Return the whole frames between start and end of a stage; raise FormatError if there are none, or too many."""
     if not stage.HasAuthoredTimeCodeRange():
         raise FormatError(
             "has no start and end time codes, which determine the frames to read.",
-            path=str(path),
             hint="Give an animation layer, or set both in the shot.",
         )
     first, last = int(np.ceil(stage.GetStartTimeCode())), int(np.floor(stage.GetEndTimeCode()))
@@ -215,32 +189,46 @@ def frames_of_stage(stage: Usd.Stage, path: object) -> NDArray[np.int64]:
         raise FormatError(
             f"its time codes run from {stage.GetStartTimeCode():g} to {stage.GetEndTimeCode():g}: this range contains "
             f"no whole frame, or more than {MAX_FRAMES}.",
-            path=str(path),
         )
     return np.arange(first, last + 1)
 
 
-def comparison_times(actor: Usd.Prim, moving: list[Usd.Attribute], by_bones: bool) -> tuple[Array, Array]:
-    """Return increasing times (n,) at which a mandible is compared with d, and the allowed landmark distances [mm].
-
-    They are the keys of d and of the mandible (if only d is keyed, the jaw does not move) and, except for bones, the
-    whole frames between, where both are interpolated differently. n is 0 without keys; there is then one distance.
-    """
-    times, keyed = key_and_frame_times([*moving, *(actor.GetAttribute(name) for name in PARAMETERS)])
-    if by_bones:
-        times, keyed = times[keyed], keyed[keyed]
-    return times, np.where(keyed, BAKED_MM, BAKED_MM + BETWEEN_MM) if len(times) else np.array([BAKED_MM])
+def parameters_at(actor: Usd.Prim, times: Array) -> Array:
+    """Return d (n, 3) [mm] of a rig prim at times (n,), or d (1, 3) at the default time if there are no times."""
+    rows = [[actor.GetAttribute(name).Get(time) for name in PARAMETERS] for time in time_codes(times)]
+    return np.array(rows, dtype=np.float64)
 
 
-def skull_displacement_mm(actor: Usd.Prim, rig: JawRig, path: object) -> float:
-    """Return the largest displacement [mm] of the skull in its actor by transforms or bones.
+class Comparison(NamedTuple):
+    """Landmark distances [mm] of a mandible from the poses given by d."""
+
+    times: list[Usd.TimeCode]
+    away_mm: Array  # the distances, shape (n,)
+    allowed_mm: Array  # the largest allowed distances, shape (n,)
+
+
+def compared_with_parameters(actor: Usd.Prim, mandible: Usd.Prim, rig: JawRig) -> Comparison:
+    """Compare a mandible with d at the keys of both (if only d is keyed, the jaw does not move), or the default time.
+
+    Except for bones, whole frames between the keys are compared too; there, both are interpolated differently.
 
     Raises:
-        FormatError: Bones deform the skull, or it is missing.
+        FormatError: The motion is not rigid.
     """
-    skull = skull_of(actor, path)
+    moving = moving_attributes(mandible, actor)
+    times, keyed = key_and_frame_times([*moving, *(actor.GetAttribute(name) for name in PARAMETERS)])
+    if bones_of(mandible) is not None:
+        times, keyed = times[keyed], keyed[keyed]
+    allowed_mm = np.where(keyed, BAKED_MM, BAKED_MM + BETWEEN_MM) if len(times) else np.array([BAKED_MM])
+    away_mm = landmark_distance(rig, poses_at(mandible, actor, times), rig.pose(parameters_at(actor, times)))
+    return Comparison(time_codes(times), away_mm, allowed_mm)
+
+
+def skull_displacement_mm(actor: Usd.Prim, rig: JawRig) -> float:
+    """Return the largest displacement [mm] of the skull in its actor; raise FormatError if bones deform it."""
+    skull = skull_of(actor)
     if skull is None:
         return 0.0
     times = time_codes(key_and_frame_times(moving_attributes(skull, actor))[0])
-    poses = poses_in_actor(skull, actor, times, path)
+    poses = poses_in_actor(skull, actor, times)
     return float(landmark_distance(rig, poses, np.broadcast_to(np.eye(4), poses.shape)).max())

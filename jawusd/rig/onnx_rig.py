@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import os
 from functools import cached_property, partial
 from pathlib import Path
 
 import numpy as np
 
-from jawusd.base.errors import FormatError, MissingDependencyError
+from jawusd.base.errors import AnyPath, FormatError, MissingDependencyError
 
 try:
     import onnxruntime  # noqa: F401
@@ -28,16 +27,14 @@ from jawusd.rig.read import load_rig
 _NEAR_MM = 1e-3  # absolute margin below which the sign is uncertain in single precision, and is computed in double
 
 
-def load_onnx(path: str | os.PathLike[str], prim: str | None = None) -> JawRig:
+def load_onnx(path: AnyPath, prim: str | None = None) -> JawRig:
     """Load the rig of an ONNX file, to be evaluated with the graphs in ONNX files.
 
     `X.onnx` decodes and contains the rig; `X_encode.onnx` in the same folder, if it exists, encodes. Files of older
-    versions contain no rig: `X.usda`, with `prim` as for `load_rig`, or `model.npz` in the same folder then provides
-    it.
+    versions contain no rig: `X.usda`, with `prim` as for `load_rig`, or `model.npz` in the folder then provides it.
 
     Raises:
-        FormatError: The file is not a decoder of jawusd or was made from another model, or there is no rig in the file
-            or its folder.
+        FormatError: The file is no decoder of jawusd, was made from another model, or there is no rig for it.
     """
     path = Path(path)
     decode = read_sidecar(path)

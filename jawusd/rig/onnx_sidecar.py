@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
@@ -22,7 +21,7 @@ from onnx.external_data_helper import convert_model_from_external_data
 from onnx.reference import ReferenceEvaluator
 
 from jawusd.base.arrays import Array
-from jawusd.base.errors import EvaluatorError, FormatError, JawusdError, RigError
+from jawusd.base.errors import AnyPath, EvaluatorError, FormatError, JawusdError, RigError
 from jawusd.base.inputs import check_input
 from jawusd.base.version import __version__
 from jawusd.evaluator import JawRig
@@ -46,12 +45,8 @@ Floats = NDArray[np.float32] | NDArray[np.float64]
 Run = Callable[[Sequence[str], Mapping[str, Floats]], list[Array]]
 
 
-def write_onnx(path: str | os.PathLike[str], model: onnx.ModelProto) -> Path:
-    """Write a graph atomically.
-
-    Raises:
-        OutputError: The file cannot be written.
-    """
+def write_onnx(path: AnyPath, model: onnx.ModelProto) -> Path:
+    """Write a graph atomically; raise OutputError if that fails."""
     write_bytes_atomic(path, model.SerializeToString(deterministic=True))
     return Path(path)
 
@@ -140,12 +135,8 @@ def _whole_rig(rig: JawRig) -> dict[str, str]:
     return {"arrays": json.dumps(arrays), "header": json.dumps(rig.meta, sort_keys=True)}
 
 
-def rig_in(model: onnx.ModelProto, path: str | os.PathLike[str]) -> JawRig | None:
-    """Return the rig in the metadata of a graph; None in files of older versions, which have none.
-
-    Raises:
-        FormatError: The metadata are damaged.
-    """
+def rig_in(model: onnx.ModelProto, path: AnyPath) -> JawRig | None:
+    """Return the rig in the metadata of a graph, None in older files; raise FormatError if it is damaged."""
     properties = _properties(model)
     if "arrays" not in properties:
         return None
@@ -185,18 +176,14 @@ def runner(graph: bytes) -> Run:
     return run_cast
 
 
-def check_written(path: str | os.PathLike[str], rig: JawRig) -> None:
-    """Check that a written sidecar reproduces the results of its model.
-
-    Raises:
-        RigError: The results deviate too far from those of the model.
-    """
+def check_written(path: AnyPath, rig: JawRig) -> None:
+    """Raise RigError if the results of a written sidecar deviate too far from those of its model."""
     error_mm = onnx_error_mm(path, rig, sample_valid(rig, PROBES))
     if not error_mm <= ALLOWED_MM:
         raise RigError(f"is {error_mm:.3f} mm from the model; the maximum is {ALLOWED_MM} mm.", path=path)
 
 
-def onnx_error_mm(path: str | os.PathLike[str], rig: JawRig, d: Array, recorded: str | None = None) -> float:
+def onnx_error_mm(path: AnyPath, rig: JawRig, d: Array, recorded: str | None = None) -> float:
     """Return the largest landmark distance [mm] between a graph and the model over parameters d (n, 3) [mm].
 
     A decoder's poses of d are compared with the model's. An encoder gets the model's poses of d; the model's poses of
@@ -229,33 +216,21 @@ def _error_mm(model: onnx.ModelProto, rig: JawRig, d: Array) -> float:
     return float(landmark_distance(rig, found, exact).max())
 
 
-def load_sidecar(path: str | os.PathLike[str], rig: JawRig, recorded: str | None = None) -> onnx.ModelProto:
-    """Read a graph that was made from the model of a rig.
-
-    Raises:
-        FormatError: see `onnx_error_mm`.
-    """
+def load_sidecar(path: AnyPath, rig: JawRig, recorded: str | None = None) -> onnx.ModelProto:
+    """Read a graph that was made from the model of a rig; raise FormatError as `onnx_error_mm` does."""
     model = read_sidecar(path, recorded)
     check_made_from(model, rig, path)
     return model
 
 
-def check_made_from(model: onnx.ModelProto, rig: JawRig, path: str | os.PathLike[str]) -> None:
-    """Check that a graph was made from the model of a rig.
-
-    Raises:
-        FormatError: The graph was made from another model.
-    """
+def check_made_from(model: onnx.ModelProto, rig: JawRig, path: AnyPath) -> None:
+    """Raise FormatError if a graph was not made from the model of a rig."""
     if _properties(model).get("rig_hash") != rig.model_hash:
         raise FormatError("was made from another model (rig_hash differs); bake the rig again.", path=path)
 
 
-def read_sidecar(path: str | os.PathLike[str], recorded: str | None = None) -> onnx.ModelProto:
-    """Read a graph.
-
-    Raises:
-        FormatError: The file is not the recorded one, or is not an ONNX file of jawusd.
-    """
+def read_sidecar(path: AnyPath, recorded: str | None = None) -> onnx.ModelProto:
+    """Read a graph; raise FormatError if it is not the recorded file, or not an ONNX file of jawusd."""
     check_input(path)
     try:
         content = Path(path).read_bytes()

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from pxr import Gf, Sdf, Usd, UsdUtils
 
-from jawusd.base.errors import RigError
+from jawusd.base.errors import AnyPath, RigError
 from jawusd.base.inputs import check_input, is_allowed
 from jawusd.formats.atomic import atomic_path, scratch_folder
 from jawusd.rig import layers, layout
@@ -30,7 +30,7 @@ _NAMES_INSIDE = "actor.usdc", "shot.usdc"
 _OFFSET = 1e-9  # makes integers non-integer: three.js (r187) decodes compressed vectors of integers as NaN
 
 
-def write_package(out: str | os.PathLike[str], source: str | os.PathLike[str]) -> Path:
+def write_package(out: AnyPath, source: AnyPath) -> Path:
     """Flatten `actor.usda`, an animation layer on it, or a shot with several actors into a `.usdz`, without ONNX files.
 
     Raises:
@@ -51,7 +51,7 @@ def write_package(out: str | os.PathLike[str], source: str | os.PathLike[str]) -
     return out
 
 
-def _flattened(stage: Usd.Stage, source: str | os.PathLike[str]) -> Sdf.Layer:
+def _flattened(stage: Usd.Stage, source: AnyPath) -> Sdf.Layer:
     layer = stage.Flatten(addSourceFileComment=False)
     rigs = _rigs_in(layer)
     if not rigs:
@@ -100,9 +100,7 @@ def _offset(value: object) -> object:
     return type(value)(first, value[1], value[2])
 
 
-def publish_rig(
-    folder: str | os.PathLike[str], out: str | os.PathLike[str], prefix: str | None = None, prim_name: str | None = None
-) -> list[Path]:
+def publish_rig(folder: AnyPath, out: AnyPath, prefix: str | None = None, prim_name: str | None = None) -> list[Path]:
     """Copy the layers and ONNX graphs of a rig to another folder under prefixed names, and write a new package.
 
     `actor.usda` becomes `hero.usda`, `rig.usdc` becomes `hero_rig.usdc`. References in the layers are updated. The

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
 from pathlib import Path
 from typing import TypedDict
 
@@ -12,7 +11,7 @@ import numpy as np
 from pxr import Sdf, Usd, UsdGeom
 
 from jawusd.base.arrays import Array
-from jawusd.base.errors import EvaluatorError, FormatError, RigError, UnitsError
+from jawusd.base.errors import AnyPath, EvaluatorError, FormatError, RigError, UnitsError
 from jawusd.base.guard import out_of_memory
 from jawusd.base.inputs import check_path
 from jawusd.evaluator import JawRig
@@ -29,10 +28,9 @@ from jawusd.rig.layout import (
 from jawusd.rig.table import DecoderTable
 from jawusd.rig.untrusted import open_checked, raises_format_error
 
-PathArg = str | os.PathLike[str]
 
-
-def load_rig(path: PathArg, prim_path: str | None = None) -> JawRig:
+@raises_format_error
+def load_rig(path: AnyPath, prim_path: str | None = None) -> JawRig:
     """Load the evaluator of a rig from a layer or package that contains it, or any stage that references an actor.
 
     `prim_path` is the rig's prim, if the stage has several rigs.
@@ -44,10 +42,10 @@ def load_rig(path: PathArg, prim_path: str | None = None) -> JawRig:
         RigError: The stage cannot be opened, or refers to files outside its folder.
     """
     stage = open_stage(path)
-    return rig_of(find_rig_prim(stage, path, prim_path), path)
+    return rig_of(find_rig_prim(stage, path, prim_path))
 
 
-def open_stage(path: PathArg) -> Usd.Stage:
+def open_stage(path: AnyPath) -> Usd.Stage:
     """Open a stage.
 
     Raises:
@@ -66,58 +64,53 @@ def open_stage(path: PathArg) -> Usd.Stage:
         raise out_of_memory(path) from error
 
 
-def find_rig_prim(stage: Usd.Stage, where: object, prim_path: str | None = None) -> Usd.Prim:
-    """Return the prim of a rig.
-
-    Raises:
-        FormatError: There is no rig, there are several, or the given prim is not a rig.
-    """
+def find_rig_prim(stage: Usd.Stage, path: AnyPath, prim_path: str | None = None) -> Usd.Prim:
+    """Return the prim of a rig; raise FormatError if there is none, there are several, or the given one is no rig."""
     if prim_path is not None:
         prim = stage.GetPrimAtPath(prim_path) if Sdf.Path.IsValidPathString(prim_path) else None
         if not prim or not has_jaw_api(prim):
-            raise FormatError(f"{prim_path} is not a jaw rig.", path=str(where))
+            raise FormatError(f"{prim_path} is not a jaw rig.", path=path)
         return prim
     prims = rig_prims(stage)
     if not prims:
-        actor = Path(str(where)).with_name(ACTOR_FILE)
-        hint = f"Give {actor}." if actor.is_file() and actor != Path(str(where)) else None
-        raise FormatError("has no jaw rig (no prim with JawRigAPI).", path=str(where), hint=hint)
+        actor = Path(path).with_name(ACTOR_FILE)
+        hint = f"Give {actor}." if actor.is_file() and actor != Path(path) else None
+        raise FormatError("has no jaw rig (no prim with JawRigAPI).", path=path, hint=hint)
     if len(prims) > 1:
         names = ", ".join(str(prim.GetPath()) for prim in prims)
-        raise FormatError(f"has several jaw rigs: {names}.", path=str(where), hint="Choose one with --prim.")
+        raise FormatError(f"has several jaw rigs: {names}.", path=path, hint="Choose one with --prim.")
     return prims[0]
 
 
-@raises_format_error(1)
-def rig_of(prim: Usd.Prim, where: object) -> JawRig:
+@raises_format_error
+def rig_of(prim: Usd.Prim) -> JawRig:
     """Build the evaluator from a rig prim.
 
     Raises:
         FormatError: The metadata are not JSON or state another model kind, a package mixes files of several actors, or
             any error of `load_rig`.
     """
-    upgrade_rig(prim, where)
-    check_units(prim, where)
-    kind = str(read_value(prim, "jaw:model:kind", where))
-    arrays = read_arrays(prim, kind, where)
+    upgrade_rig(prim)
+    check_units(prim)
+    kind = str(read_value(prim, "jaw:model:kind"))
+    arrays = read_arrays(prim, kind)
     try:
-        meta = json.loads(str(read_value(prim, "jaw:meta", where)))
+        meta = json.loads(str(read_value(prim, "jaw:meta")))
     except (TypeError, ValueError) as error:
-        raise FormatError(f"jaw:meta is not JSON ({error}).", path=str(where)) from error
+        raise FormatError(f"jaw:meta is not JSON ({error}).") from error
     if not isinstance(meta, dict):
-        raise FormatError("jaw:meta must be a JSON object.", path=str(where))
+        raise FormatError("jaw:meta must be a JSON object.")
     if meta.get("kind") != kind:
-        raise FormatError(f"jaw:model:kind is {kind!r}, but jaw:meta has {meta.get('kind')!r}.", path=str(where))
+        raise FormatError(f"jaw:model:kind is {kind!r}, but jaw:meta has {meta.get('kind')!r}.")
     try:
         rig = JawRig(arrays, meta)
     except EvaluatorError as error:
-        raise FormatError(error.message, path=str(where)) from error
+        raise FormatError(error.message) from error
     # In a folder, a mismatch may come from edited thresholds; in a package, files of equal names were mixed.
     packed = prim.GetStage().GetRootLayer().identifier.endswith(".usdz")
     if packed and not set(recorded_hashes(prim)) <= {None, rig.model_hash}:
         raise FormatError(
             f"{prim.GetPath()} does not match its model (jaw:modelHash): packing mixed up files of several actors.",
-            path=str(where),
             hint="Pack shots with `jawusd publish SHOT -o shot.usdz`, or publish the actors under other names first.",
         )
     return rig
@@ -135,51 +128,38 @@ def recorded_hashes(prim: Usd.Prim) -> tuple[object, object]:
     return own, prim.GetAttribute(PARAMETERS[0]).GetCustomDataByKey(MODEL_HASH_KEY) if keyed else None
 
 
-def check_units(prim: Usd.Prim, where: object) -> None:
-    """Check units and twist order.
-
-    Raises:
-        UnitsError: The units or the twist order differ from mm, rad and (omega, v).
-    """
+def check_units(prim: Usd.Prim) -> None:
+    """Raise UnitsError if units or twist order of a rig prim differ from mm, rad and (omega, v)."""
     for name, wanted in (("jaw:lengthUnit", "mm"), ("jaw:angleUnit", "rad"), ("jaw:twistOrder", ["omega", "v"])):
-        found = np.array(read_value(prim, name, where)).tolist()
+        found = np.array(read_value(prim, name)).tolist()
         if found != wanted:
-            raise UnitsError(f"{name} is {found}; expected {wanted}.", path=str(where))
+            raise UnitsError(f"{name} is {found}; expected {wanted}.")
 
 
-@raises_format_error(1)
-def read_table(prim: Usd.Prim, where: object) -> DecoderTable:
-    """Read the sampled decoder of a rig prim.
-
-    Raises:
-        FormatError: Values are missing or inconsistent.
-        VersionError: The rig was written by a newer version.
-    """
-    upgrade_rig(prim, where)
-    stored_as = str(read_value(prim, "jaw:decoder:format", where))
-    d1, d2, d3 = (_numbers(prim, f"jaw:decoder:d{i}Knots", where) for i in (1, 2, 3))
+@raises_format_error
+def read_table(prim: Usd.Prim) -> DecoderTable:
+    """Read the sampled decoder of a rig prim; raise FormatError if values are inconsistent, VersionError if too new."""
+    upgrade_rig(prim)
+    stored_as = str(read_value(prim, "jaw:decoder:format"))
+    d1, d2, d3 = (_numbers(prim, f"jaw:decoder:d{i}Knots") for i in (1, 2, 3))
     axes, counts = (d1, d2, d3), [len(d1), len(d2), len(d3)]
-    found = _numbers(prim, "jaw:decoder:shape", where).tolist()
+    found = _numbers(prim, "jaw:decoder:shape").tolist()
     if found != counts or min(counts) < 2 or any((np.diff(axis) <= 0).any() for axis in axes):
-        raise FormatError(
-            f"jaw:decoder:shape is {[int(n) for n in found]}; expected {counts}, the numbers of knots.",
-            path=str(where),
-        )
-    twists = _numbers(prim, "jaw:decoder:twists", where).astype(np.float32)
+        raise FormatError(f"jaw:decoder:shape is {[int(n) for n in found]}; expected {counts}, the numbers of knots.")
+    twists = _numbers(prim, "jaw:decoder:twists").astype(np.float32)
     shape = (*counts, 6) if stored_as == "grid" else (sum(counts), 6)
     if twists.size != math.prod(shape):
         raise FormatError(
             f"jaw:decoder:twists has {twists.size} numbers; expected {math.prod(shape)}, of shape {shape}.",
-            path=str(where),
         )
     if not np.isfinite(twists).all() or not all(np.isfinite(axis).all() for axis in axes):
-        raise FormatError("jaw:decoder has values that are not finite.", path=str(where))
-    error_mm, samples = (_numbers(prim, f"jaw:decoder:{name}", where) for name in ("maxError", "errorSamples"))
+        raise FormatError("jaw:decoder has values that are not finite.")
+    error_mm, samples = (_numbers(prim, f"jaw:decoder:{name}") for name in ("maxError", "errorSamples"))
     return DecoderTable(stored_as, axes, twists.reshape(shape), float(error_mm), int(samples))
 
 
-def _numbers(prim: Usd.Prim, name: str, where: object) -> Array:
-    return np.array(read_value(prim, name, where), dtype=np.float64)
+def _numbers(prim: Usd.Prim, name: str) -> Array:
+    return np.array(read_value(prim, name), dtype=np.float64)
 
 
 class TableDescription(TypedDict):
@@ -218,15 +198,15 @@ class Description(TypedDict):
     errors: object
 
 
-@raises_format_error(0)
-def describe(path: PathArg, prim_path: str | None = None) -> Description:
+@raises_format_error
+def describe(path: AnyPath, prim_path: str | None = None) -> Description:
     """Return the contents of a rig file, for `jawusd info`; arguments and errors as for `load_rig`."""
     stage = open_stage(path)
     prim = find_rig_prim(stage, path, prim_path)
-    rig = rig_of(prim, path)
-    table = read_table(prim, path)
+    rig = rig_of(prim)
+    table = read_table(prim)
     speeds = rig.speeds
-    names = np.array(read_value(prim, "jaw:landmarks:names", path)).tolist()
+    names = np.array(read_value(prim, "jaw:landmarks:names")).tolist()
     samples = key_times(prim.GetAttribute(PARAMETERS[0]))
     animation = {"samples": len(samples), "first": samples[0], "last": samples[-1]} if samples else None
     onnx = [prim.GetAttribute(name).Get() for name in ONNX_ATTRIBUTES]
@@ -234,10 +214,10 @@ def describe(path: PathArg, prim_path: str | None = None) -> Description:
     return {
         "file": str(path),
         "prim": str(prim.GetPath()),
-        "format_version": int(_numbers(prim, "jaw:formatVersion", path)),
-        "actor": str(read_value(prim, "jaw:actor", path)),
+        "format_version": int(_numbers(prim, "jaw:formatVersion")),
+        "actor": str(read_value(prim, "jaw:actor")),
         "model": {"kind": rig.kind, "method": rig.method or None},
-        "model_hash": str(read_value(prim, "jaw:modelHash", path)),
+        "model_hash": str(read_value(prim, "jaw:modelHash")),
         "units": {"length": "mm", "angle": "rad"},
         "twist_order": ["omega", "v"],
         "ranges_mm": {name.removeprefix("jaw:"): row.tolist() for name, row in zip(PARAMETERS, rig.d_range)},
@@ -252,7 +232,7 @@ def describe(path: PathArg, prim_path: str | None = None) -> Description:
         "onnx": [asset.path for asset in onnx if asset is not None],
         "fps": stage.GetTimeCodesPerSecond(),
         "animation": animation,
-        "meshes": _meshes(prim, path),
+        "meshes": _meshes(prim),
         "placeholders": [mesh.GetName() for mesh in placeholders],
         "estimated_condyles": _estimated_condyles(placeholders),
         "contact": rig.meta.get("contact"),
@@ -274,7 +254,7 @@ def _estimated_condyles(placeholders: list[Usd.Prim]) -> dict[str, str | float |
     return {"source": source, "error_mm": error}
 
 
-def _meshes(prim: Usd.Prim, where: object) -> dict[str, int]:
+def _meshes(prim: Usd.Prim) -> dict[str, int]:
     """Return the number of points of every mesh below a prim, by name."""
     meshes = [UsdGeom.Mesh(p) for p in meshes_below(prim)]
-    return {mesh.GetPrim().GetName(): len(np.array(value_of(mesh.GetPointsAttr(), where) or [])) for mesh in meshes}
+    return {mesh.GetPrim().GetName(): len(np.array(value_of(mesh.GetPointsAttr()) or [])) for mesh in meshes}

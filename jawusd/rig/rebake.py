@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal, NamedTuple
@@ -12,26 +11,16 @@ from numpy.typing import ArrayLike
 from pxr import Sdf, Usd, UsdGeom, Vt
 
 from jawusd.base.arrays import Array
-from jawusd.base.errors import FormatError, RigError
+from jawusd.base.errors import AnyPath, FormatError, RigError, naming_file
 from jawusd.evaluator import JawRig
+from jawusd.rig import motion_read
 from jawusd.rig.animation import author_motion, note_unseen
 from jawusd.rig.asset_paths import paths_in, prim_spec_at
 from jawusd.rig.attributes import key_times
 from jawusd.rig.layers import new_layer, relative_path, set_attribute, write_layer
 from jawusd.rig.layout import MOTION, PARAMETERS, SKELETON, TRANSFORMS, rig_prims
-from jawusd.rig.motion_read import (
-    BAKED_MM,
-    comparison_times,
-    frames_of_stage,
-    mandible_of,
-    moving_attributes,
-    parameters_of,
-    poses_at,
-    skull_displacement_mm,
-)
 from jawusd.rig.read import find_rig_prim, open_stage, rig_of
 from jawusd.rig.skel import bones_of
-from jawusd.rig.table import landmark_distance
 from jawusd.rig.untrusted import raises_format_error
 
 Origin = Literal["d", "mandible"]
@@ -58,8 +47,8 @@ class Deviation(NamedTuple):
     largest_mm: float  # largest landmark distance
 
 
-@raises_format_error(0)
-def deviation(path: str | os.PathLike[str], rig: JawRig, prim_path: str | None = None) -> Deviation | None:
+@raises_format_error
+def deviation(path: AnyPath, rig: JawRig, prim_path: str | None = None) -> Deviation | None:
     """Return the deviation of a stage's mandible from the pose given by d; None if d has no keys.
 
     Raises:
@@ -67,25 +56,23 @@ def deviation(path: str | os.PathLike[str], rig: JawRig, prim_path: str | None =
         FormatError: No rig or several rigs, no mandible, or parameters that are not finite.
     """
     stage = open_stage(path)
-    return _deviation(_actor(stage, path, rig, prim_path), rig, path)
+    return _deviation(_actor(stage, path, rig, prim_path), rig)
 
 
-def _deviation(actor: Usd.Prim, rig: JawRig, path: object) -> Deviation | None:
-    stage, mandible = actor.GetStage(), mandible_of(actor, path)
-    moving, parameters = moving_attributes(mandible, actor), [actor.GetAttribute(name) for name in PARAMETERS]
-    sampled = parameters_of(actor, path)
+def _deviation(actor: Usd.Prim, rig: JawRig) -> Deviation | None:
+    stage, mandible = actor.GetStage(), motion_read.mandible_of(actor)
+    parameters = [actor.GetAttribute(name) for name in PARAMETERS]
+    moving = motion_read.moving_attributes(mandible, actor)
+    sampled = motion_read.parameters_of(actor)
     if not all(parameters) or (sampled is None and _rank(stage, parameters) >= _rank(stage, moving)):
         return None
-    times, allowed_mm = comparison_times(actor, moving, bones_of(mandible) is not None)
-    times = times if len(times) else np.zeros(1)
-    d = np.array([[attribute.Get(time) for attribute in parameters] for time in times.tolist()], dtype=np.float64)
-    away = landmark_distance(rig, poses_at(mandible, actor, times, path), rig.pose(d))
-    return Deviation(int((~(away <= allowed_mm)).sum()), len(away), float(away.max()))
+    times, away_mm, allowed_mm = motion_read.compared_with_parameters(actor, mandible, rig)
+    return Deviation(int((~(away_mm <= allowed_mm)).sum()), len(times), float(away_mm.max()))
 
 
-@raises_format_error(0)
+@raises_format_error
 def motion_of_stage(
-    path: str | os.PathLike[str], rig: JawRig, prim_path: str | None = None, origin: Origin | None = None
+    path: AnyPath, rig: JawRig, prim_path: str | None = None, origin: Origin | None = None
 ) -> StageMotion:
     """Read the motion of a rig in a stage from whichever was edited: keys of d or transforms of the mandible.
 
@@ -100,59 +87,57 @@ def motion_of_stage(
     """
     stage = open_stage(path)
     actor = _actor(stage, path, rig, prim_path)
-    mandible = mandible_of(actor, path)
+    mandible = motion_read.mandible_of(actor)
     if origin is None:
-        origin = _origin(stage, actor, mandible, _deviation(actor, rig, path), path)
-    sampled = parameters_of(actor, path)
+        origin = _origin(stage, actor, mandible, _deviation(actor, rig))
+    sampled = motion_read.parameters_of(actor)
     if origin == "d":
-        sampled = _constant_motion(stage, actor, path) if sampled is None else sampled
+        sampled = _constant_motion(stage, actor) if sampled is None else sampled
         return StageMotion(*sampled, origin, np.zeros(len(sampled[0])), prim=str(actor.GetPath()))
-    frames = frames_of_stage(stage, path)
-    d, residual_mm = rig.encode(poses_at(mandible, actor, frames, path))
+    frames = motion_read.frames_of_stage(stage)
+    d, residual_mm = rig.encode(motion_read.poses_at(mandible, actor, frames))
     fps = float(stage.GetTimeCodesPerSecond())
     return StageMotion(frames.astype(np.float64), d, fps, origin, residual_mm, prim=str(actor.GetPath()))
 
 
-def _origin(stage: Usd.Stage, actor: Usd.Prim, mandible: Usd.Prim, deviating: Deviation | None, path: object) -> Origin:
+def _origin(stage: Usd.Stage, actor: Usd.Prim, mandible: Usd.Prim, deviating: Deviation | None) -> Origin:
     if deviating is None:
         return "mandible"
     if not deviating.frames:
         return "d"
-    moving = moving_attributes(mandible, actor)
+    moving = motion_read.moving_attributes(mandible, actor)
     if not any(key_times(attribute) for attribute in moving):
         return "d"
     ranks = [_rank(stage, attributes) for attributes in ([actor.GetAttribute(name) for name in PARAMETERS], moving)]
     if ranks[0] == ranks[1]:
         raise RigError(
             f"d and the mandible disagree by up to {deviating.largest_mm:.2f} mm, and both have keys in one layer.",
-            path=str(path),
             hint="Choose the one to use: --from d or --from mandible.",
         )
     return "d" if ranks[0] < ranks[1] else "mandible"
 
 
-def _actor(stage: Usd.Stage, path: object, rig: JawRig, prim_path: str | None) -> Usd.Prim:
+def _actor(stage: Usd.Stage, path: AnyPath, rig: JawRig, prim_path: str | None) -> Usd.Prim:
     """Return the stage's rig prim; among several, the only one with the same model. Rejects rigs of other subjects."""
     alike = [p for p in rig_prims(stage) if p.GetAttribute("jaw:modelHash").Get() == rig.model_hash]
     found = alike[0] if prim_path is None and len(alike) == 1 else find_rig_prim(stage, path, prim_path)
-    own, other = (str(meta.get("actor") or "") for meta in (rig.meta, rig_of(found, path).meta))
+    own, other = (str(meta.get("actor") or "") for meta in (rig.meta, rig_of(found).meta))
     if own and other and own != other:
         raise FormatError(
             f'{found.GetPath()} is the rig of "{other}", but the given rig is of "{own}"; their d and bounds differ.',
-            path=str(path),
             hint="Give the rig of that subject, or transfer the motion with `jawusd retarget`.",
         )
     return found
 
 
-def _constant_motion(stage: Usd.Stage, actor: Usd.Prim, path: object) -> tuple[Array, Array, float]:
+def _constant_motion(stage: Usd.Stage, actor: Usd.Prim) -> tuple[Array, Array, float]:
     """Return the motion of a rig whose d is not animated: first and last frame, d at both [mm], frames per second."""
-    frames = frames_of_stage(stage, path)[[0, -1]]
-    d = np.array([actor.GetAttribute(name).Get() for name in PARAMETERS], dtype=np.float64)
+    frames = motion_read.frames_of_stage(stage)[[0, -1]]
+    d = motion_read.parameters_at(actor, np.zeros(0))
     if not np.isfinite(d).all():
-        raise FormatError("its d has values that are not finite.", path=str(path))
+        raise FormatError("its d has values that are not finite.")
     times = np.unique(frames).astype(np.float64)
-    return times, np.tile(d, (len(times), 1)), float(stage.GetTimeCodesPerSecond())
+    return times, np.repeat(d, len(times), axis=0), float(stage.GetTimeCodesPerSecond())
 
 
 def _rank(stage: Usd.Stage, attributes: list[Usd.Attribute]) -> float:
@@ -163,8 +148,8 @@ def _rank(stage: Usd.Stage, attributes: list[Usd.Attribute]) -> float:
 
 
 def write_over(
-    out: str | os.PathLike[str],
-    stage: str | os.PathLike[str],
+    out: AnyPath,
+    stage: AnyPath,
     rig: JawRig,
     frames: ArrayLike,
     d: Array,
@@ -201,8 +186,8 @@ class Rebaked(NamedTuple):
 
 
 def write_rebaked(
-    out: str | os.PathLike[str],
-    shot: str | os.PathLike[str],
+    out: AnyPath,
+    shot: AnyPath,
     motions: Sequence[Rebaked],
     carried: ArrayLike = (),
     by_skin: ArrayLike = (),
@@ -232,10 +217,11 @@ def write_rebaked(
     stage = open_stage(shot)
     layer = _layer_over(stage, np.concatenate([motion.times for motion in motions]))
     note_unseen(layer, carried, by_skin)
-    actors = [_actor(stage, shot, motion.rig, motion.prim) for motion in motions]
-    for actor, motion in zip(actors, motions, strict=True):
-        _author(layer, actor, motion, shot)
-    _check_moves(layer, [str(actor.GetPath()) for actor in actors], motions, shot)
+    with naming_file(shot):
+        actors = [_actor(stage, shot, motion.rig, motion.prim) for motion in motions]
+        for actor, motion in zip(actors, motions, strict=True):
+            _author(layer, actor, motion)
+        _check_moves(layer, [str(actor.GetPath()) for actor in actors], motions, shot)
     if root:
         layer.subLayerPaths.append(relative_path(Path(shot), out))
     write_layer(layer, out)
@@ -254,13 +240,12 @@ def _layer_over(stage: Usd.Stage, times: Array) -> Sdf.Layer:
     return layer
 
 
-def _author(layer: Sdf.Layer, actor: Usd.Prim, motion: Rebaked, shot: object) -> None:
-    mandible = mandible_of(actor, shot)
-    if not (away_mm := skull_displacement_mm(actor, motion.rig, shot)) <= BAKED_MM:
+def _author(layer: Sdf.Layer, actor: Usd.Prim, motion: Rebaked) -> None:
+    mandible = motion_read.mandible_of(actor)
+    if not (away_mm := motion_read.skull_displacement_mm(actor, motion.rig)) <= motion_read.BAKED_MM:
         raise RigError(
             f"the skull of {actor.GetPath()} is moved by {away_mm:.2f} mm; "
             "a baked mandible would be displaced by as much.",
-            path=str(shot),
             hint="Move the actor instead of its skull, or animate it: jawusd encode, then jawusd animate.",
         )
     paths = str(actor.GetPath()), str(mandible.GetPath())
@@ -272,7 +257,6 @@ def _author(layer: Sdf.Layer, actor: Usd.Prim, motion: Rebaked, shot: object) ->
         if actor.GetVariantSet(MOTION).GetVariantSelection() != SKELETON:
             raise RigError(
                 f"bones move {mandible.GetPath()} and would override the baked motion.",
-                path=str(shot),
                 hint="Animate the actor itself: jawusd encode, then jawusd animate.",
             )
         layer.GetPrimAtPath(actor.GetPath()).variantSelections[MOTION] = TRANSFORMS
@@ -281,18 +265,17 @@ def _author(layer: Sdf.Layer, actor: Usd.Prim, motion: Rebaked, shot: object) ->
             layer.GetPrimAtPath(prefix).instanceable = False
 
 
-def _check_moves(layer: Sdf.Layer, prims: list[str], motions: Sequence[Rebaked], shot: str | os.PathLike[str]) -> None:
+def _check_moves(layer: Sdf.Layer, prims: list[str], motions: Sequence[Rebaked], shot: AnyPath) -> None:
     """Raise RigError if a mandible, composed in its stage with a layer, lacks the pose given by d in the world."""
     root = Sdf.Layer.CreateAnonymous(".usda")
     root.timeCodesPerSecond = layer.timeCodesPerSecond
     root.subLayerPaths = [layer.identifier, str(Path(shot).resolve())]
     composed = Usd.Stage.Open(root)
     for prim, motion in zip(prims, motions, strict=True):
-        away = _deviation(composed.GetPrimAtPath(prim), motion.rig, shot)
+        away = _deviation(composed.GetPrimAtPath(prim), motion.rig)
         if away is not None and away.frames:
             raise RigError(
                 f"the mandible of {prim} would still be {away.largest_mm:.2f} mm from the pose given by d.",
-                path=str(shot),
                 hint="Prims above or below the mandible move it as well: `jawusd validate` lists them.",
             )
 

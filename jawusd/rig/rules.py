@@ -16,18 +16,9 @@ from jawusd.base.arrays import Array
 from jawusd.base.errors import FormatError, JawusdError
 from jawusd.evaluator import JawRig
 from jawusd.evaluator.verdicts import OUTSIDE, place
+from jawusd.rig import motion_read
 from jawusd.rig.attributes import key_and_frame_times, time_codes
 from jawusd.rig.layout import MOTION, ONNX_ATTRIBUTES, PARAMETERS, SIDECAR_HASH_KEY, SKELETON, meshes_below
-from jawusd.rig.motion_read import (
-    BAKED_MM,
-    comparison_times,
-    mandible_of,
-    moving_attributes,
-    poses_at,
-    prims_between,
-    skull_displacement_mm,
-    skull_of,
-)
 from jawusd.rig.read import read_table, recorded_hashes, rig_of
 from jawusd.rig.skel import bones_of
 from jawusd.rig.table import landmark_distance, sample_valid
@@ -53,27 +44,27 @@ class Finding:
 
 
 Rule = Callable[[Usd.Prim], Iterator[Finding]]
-_Fault = tuple[str, Usd.Prim, str]  # severity ("error" or "warning"), prim, message
+_Fault = tuple[str, Usd.Prim, str]  # severity, prim, message
 
 
-def check_model(prim: Usd.Prim) -> Iterator[Finding]:
+def check_model(prim: Usd.Prim) -> Iterator[_Fault]:
     """Check that version, units and model arrays can be read, and that the motion was made with this model."""
-    rig = rig_of(prim, _where(prim))
+    rig = rig_of(prim)
     own, made_for = recorded_hashes(prim)
     if own not in (None, rig.model_hash):
         message = "the rig was baked from another model (jaw:modelHash): files of several actors were mixed, "
         message += "or model values such as ranges were edited. `jawusd publish` gives each actor unique file names."
-        yield _finding("error", "Model", prim, message)
+        yield "error", prim, message
     if made_for not in (None, rig.model_hash):
         message = f"the motion was made with another model (see {PARAMETERS[0]}). "
         message += "Either files of several actors were mixed: run `jawusd publish` on them first. "
         message += "Or the rig was rebuilt since: run `jawusd rebake` on the motion."
-        yield _finding("error", "Model", prim, message)
+        yield "error", prim, message
 
 
-def check_table(prim: Usd.Prim) -> Iterator[Finding]:
+def check_table(prim: Usd.Prim) -> Iterator[_Fault]:
     """Check that the sampled table is complete and within its stated error of the exact model."""
-    table = read_table(prim, _where(prim))
+    table = read_table(prim)
     rig = _rig(prim)
     if rig is None:
         return
@@ -82,10 +73,10 @@ def check_table(prim: Usd.Prim) -> Iterator[Finding]:
     error_mm = landmark_distance(rig, read, rig.pose(d)).max()
     if error_mm > table.max_error_mm + _TABLE_SLACK_MM:
         message = f"the table is {error_mm:.3f} mm from the model; maxError is {table.max_error_mm:.3f} mm."
-        yield _finding("error", "Table", prim, message)
+        yield "error", prim, message
 
 
-def check_onnx(prim: Usd.Prim) -> Iterator[Finding]:
+def check_onnx(prim: Usd.Prim) -> Iterator[_Fault]:
     """Check that the ONNX files of the rig were made from this model and reproduce its results."""
     rig = _rig(prim)
     attributes = [prim.GetAttribute(name) for name in ONNX_ATTRIBUTES]
@@ -95,146 +86,97 @@ def check_onnx(prim: Usd.Prim) -> Iterator[Finding]:
     try:
         from jawusd.rig.onnx_sidecar import ALLOWED_MM, PROBES, onnx_error_mm
     except ImportError:
-        yield _finding("info", "Onnx", prim, "not checked: the package onnx is not installed (jawusd[build]).")
+        yield "info", prim, "not checked: the package onnx is not installed (jawusd[build])."
         return
     d = sample_valid(rig, PROBES)
     for asset, recorded in assets.items():
         if not asset.resolvedPath:
-            yield _finding("error", "Onnx", prim, f"{asset.path} does not exist.")
+            yield "error", prim, f"{asset.path} does not exist."
             continue
         try:
             error_mm = onnx_error_mm(asset.resolvedPath, rig, d, recorded)
         except JawusdError as error:
-            yield _finding("error", "Onnx", prim, f"{asset.path} {error.message}")
+            yield "error", prim, f"{asset.path} {error.message}"
             continue
         if not error_mm <= ALLOWED_MM:
             message = f"{asset.path} is {error_mm:.3f} mm from the model; the maximum is {ALLOWED_MM} mm."
-            yield _finding("error", "Onnx", prim, message)
+            yield "error", prim, message
 
 
-def check_bounds(prim: Usd.Prim) -> Iterator[Finding]:
+def check_bounds(prim: Usd.Prim) -> Iterator[_Fault]:
     """Check that d1, d2, d3 are inside the bound at every time; deviations within the tolerance are only noted."""
     rig = _rig(prim)
     if rig is None:
         return
-    times = time_codes(key_and_frame_times(prim.GetAttribute(name) for name in PARAMETERS)[0])
-    d = _parameters(prim, times)
+    times, _ = key_and_frame_times(prim.GetAttribute(name) for name in PARAMETERS)
+    d = motion_read.parameters_at(prim, times)
     margin = rig.margin(d)
     worst = int(np.argmin(np.where(np.isfinite(margin), margin, -np.inf)))
     outside = ~rig.is_inside(d)
     if outside.any():
         values = ", ".join(f"{x:.2f}" for x in d[worst])
         verdict = place(float(margin[worst]), rig.tolerance_mm)
-        message = f"{outside.sum()} of {len(d)} samples are outside; worst at {times[worst]}: d = ({values}) mm, "
+        message = (
+            f"{outside.sum()} of {len(d)} samples are outside; worst at {time_codes(times)[worst]}: d = ({values}) mm, "
+        )
         message += f"margin {margin[worst]:.2f} mm, {verdict}."
-        yield _finding("warning" if verdict == OUTSIDE else "info", "Bounds", prim, message)
+        yield "warning" if verdict == OUTSIDE else "info", prim, message
 
 
-def check_mandible(prim: Usd.Prim) -> Iterator[Finding]:
+def check_mandible(prim: Usd.Prim) -> Iterator[_Fault]:
     """Check that the mandible moves like the model, and only by translate (double3) and orient (quatd) or by bones."""
     if not prim.IsLoaded():
-        yield _finding("error", "Mandible", prim, "the geometry (payload) is not loaded and cannot be checked.")
+        yield "error", prim, "the geometry (payload) is not loaded and cannot be checked."
         return
-    mandible = mandible_of(prim, _where(prim))
+    mandible = motion_read.mandible_of(prim)
     bones, body = bones_of(mandible), UsdGeom.Xformable(mandible)
     names = [(op.GetOpName(), op.GetTypeName()) for op in body.GetOrderedXformOps()]
     if bones is None and (names != _OPS or body.GetResetXformStack()):
         message = f"the ops are {names}; expected translate (double3) and orient (quatd)."
         if body.GetResetXformStack():
             message = "!resetXformStack! detaches it from the actor: it does not move with the actor."
-        yield _finding("error", "Mandible", mandible, message)
+        yield "error", mandible, message
         return
     rig = _rig(prim)
     if rig is None:
         return
-    moving = moving_attributes(mandible, prim)
-    at, allowed_mm = comparison_times(prim, moving, bones is not None)
-    times = time_codes(at)
     try:
-        baked = poses_at(mandible, prim, at, _where(prim))
-        away_mm = skull_displacement_mm(prim, rig, _where(prim))
+        times, error_mm, allowed_mm = motion_read.compared_with_parameters(prim, mandible, rig)
+        away_mm = motion_read.skull_displacement_mm(prim, rig)
     except FormatError as error:
-        yield _finding("error", "Mandible", mandible, error.message)
+        yield "error", mandible, error.message
         return
-    if not away_mm <= BAKED_MM:
-        message = f"the skull is moved in the actor by {away_mm:.3f} mm; the maximum is {BAKED_MM} mm. "
+    if not away_mm <= motion_read.BAKED_MM:
+        message = f"the skull is moved in the actor by {away_mm:.3f} mm; the maximum is {motion_read.BAKED_MM} mm. "
         message += "Move the actor instead."
-        yield _finding("error", "Mandible", prim, message)
+        yield "error", prim, message
         return
-    error_mm = landmark_distance(rig, baked, rig.pose(_parameters(prim, times)))
     over_mm = error_mm - allowed_mm
     worst = int(np.argmax(np.where(np.isfinite(over_mm), over_mm, np.inf)))
     if not over_mm[worst] <= 0:
         message = f"the baked pose at {times[worst]} is {error_mm[worst]:.3f} mm from the pose of d; "
         message += f"the maximum is {allowed_mm[worst]:.2f} mm."
-        keyed = any(attribute.GetNumTimeSamples() for attribute in moving)
+        keyed = any(attribute.GetNumTimeSamples() for attribute in motion_read.moving_attributes(mandible, prim))
         message += " To make them agree, run" if keyed else " Only d is keyed, not the mandible: bake it with"
-        yield _finding("error", "Mandible", mandible, f"{message} `jawusd rebake`.")
-
-
-def check_assembly(prim: Usd.Prim) -> Iterator[Finding]:
-    """Check that a shot does not hide, deform, detach or rescale the jaw of an actor."""
-    for severity, at, message in _faults_of_assembly(prim):
-        yield _finding(severity, "Assembly", at, message)
-
-
-def _reporting_errors(name: str, rule: Rule) -> Rule:
-    """Return a rule that reports what cannot be read, and values of unexpected types, as an error."""
-
-    @functools.wraps(rule)
-    def checked(prim: Usd.Prim) -> Iterator[Finding]:
-        try:
-            yield from rule(prim)
-        except JawusdError as error:
-            yield _finding("error", name, prim, error.message)
-        except VALUE_ERRORS as error:
-            yield _finding("error", name, prim, value_error_message(error))
-
-    return checked
-
-
-RULES: dict[str, Rule] = {
-    name: _reporting_errors(name, rule)
-    for name, rule in {
-        "Model": check_model,
-        "Table": check_table,
-        "Onnx": check_onnx,
-        "Bounds": check_bounds,
-        "Mandible": check_mandible,
-        "Assembly": check_assembly,
-    }.items()
-}
-
-
-def _where(prim: Usd.Prim) -> str:
-    return prim.GetStage().GetRootLayer().identifier
-
-
-def _finding(severity: str, rule: str, prim: Usd.Prim, message: str) -> Finding:
-    return Finding(severity, rule, str(prim.GetPath()), message)
+        yield "error", mandible, f"{message} `jawusd rebake`."
 
 
 def _rig(prim: Usd.Prim) -> JawRig | None:
     """Return the evaluator; None if `check_model` finds an error."""
     try:
-        return rig_of(prim, _where(prim))
+        return rig_of(prim)
     except JawusdError:
         return None
 
 
-def _parameters(prim: Usd.Prim, times: list[Usd.TimeCode]) -> Array:
-    rows = [[prim.GetAttribute(name).Get(time) for name in PARAMETERS] for time in times]
-    return np.array(rows, dtype=np.float64)
-
-
-def _faults_of_assembly(actor: Usd.Prim) -> Iterator[_Fault]:
-    """Yield those faults of a rig in its stage that the other rules do not find."""
+def check_assembly(actor: Usd.Prim) -> Iterator[_Fault]:
+    """Check that a shot does not hide, deform, detach or rescale the jaw of an actor."""
     for name in actor.GetStage().GetMutedLayers():
         yield "error", actor, f"the layer {name} is muted."
     yield from _units(actor)
     yield from _shape(actor)
     try:
-        skull, mandible = skull_of(actor, _where(actor)), mandible_of(actor, _where(actor))
+        skull, mandible = motion_read.skull_of(actor), motion_read.mandible_of(actor)
     except FormatError as error:
         if error.message.startswith("jaw:skull"):
             yield "error", actor, error.message
@@ -278,7 +220,7 @@ def _axes(actor: Usd.Prim, time: Usd.TimeCode) -> Array:
 
 def _shape(actor: Usd.Prim) -> Iterator[_Fault]:
     """Find transforms of an actor or its parents that deform or mirror it at one of their keys."""
-    above = prims_between(actor, actor.GetStage().GetPseudoRoot())
+    above = motion_read.prims_between(actor, actor.GetStage().GetPseudoRoot())
     moving = [op.GetAttr() for prim in above for op in UsdGeom.Xformable(prim).GetOrderedXformOps()]
     times = time_codes(key_and_frame_times(moving)[0])
     axes = np.array([_axes(actor, time) for time in times])
@@ -298,7 +240,7 @@ def _shape(actor: Usd.Prim) -> Iterator[_Fault]:
 def _resets(actor: Usd.Prim, parts: list[Usd.Prim]) -> Iterator[_Fault]:
     """Find prims in an actor that reset the transform stack."""
     meshes = [mesh for part in parts for mesh in meshes_below(part)]
-    for prim in dict.fromkeys(above for mesh in meshes for above in prims_between(mesh, actor)):
+    for prim in dict.fromkeys(above for mesh in meshes for above in motion_read.prims_between(mesh, actor)):
         if prim not in parts[-1:] and UsdGeom.Xformable(prim).GetResetXformStack():  # another rule checks the mandible
             yield "error", prim, "!resetXformStack! detaches it from the actor."
 
@@ -345,3 +287,34 @@ def _joints(actor: Usd.Prim, mandible: Usd.Prim) -> Iterator[_Fault]:
     if foreign:
         message = f"the joints {', '.join(foreign)} are animated, but the skeleton has no joints of these names."
         yield "error", mandible, message
+
+
+def _rule(name: str, check: Callable[[Usd.Prim], Iterator[_Fault]]) -> Rule:
+    """Return a check as a rule that also reports what cannot be read, and values of unexpected types, as an error."""
+
+    def faults(prim: Usd.Prim) -> Iterator[_Fault]:
+        try:
+            yield from check(prim)
+        except JawusdError as error:
+            yield "error", prim, error.message
+        except VALUE_ERRORS as error:
+            yield "error", prim, value_error_message(error)
+
+    @functools.wraps(check)
+    def rule(prim: Usd.Prim) -> Iterator[Finding]:
+        return (Finding(severity, name, str(at.GetPath()), message) for severity, at, message in faults(prim))
+
+    return rule
+
+
+RULES: dict[str, Rule] = {
+    name: _rule(name, check)
+    for name, check in {
+        "Model": check_model,
+        "Table": check_table,
+        "Onnx": check_onnx,
+        "Bounds": check_bounds,
+        "Mandible": check_mandible,
+        "Assembly": check_assembly,
+    }.items()
+}

@@ -5,7 +5,6 @@ Written for every actor, and read from stages in which bones move the meshes (`m
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable
 from functools import partial
 from pathlib import Path
@@ -15,7 +14,7 @@ from numpy.typing import ArrayLike
 from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdSkel, Vt
 
 from jawusd.base.arrays import Array
-from jawusd.base.errors import FormatError
+from jawusd.base.errors import AnyPath, FormatError
 from jawusd.evaluator import JawRig
 from jawusd.geometry.anatomy import LANDMARKS
 from jawusd.geometry.se3 import make_transform, se3_inverse, transform_points
@@ -32,7 +31,7 @@ _BIND_RIGIDLY = "Bind every mesh of the mandible to one joint, or name meshes to
 
 
 def write_skel(
-    out: str | os.PathLike[str],
+    out: AnyPath,
     rig: JawRig,
     mesh_names: list[str],
     fps: float,
@@ -42,14 +41,9 @@ def write_skel(
 ) -> Path:
     """Write the skeleton layer next to `geo.usdc`, whose meshes it binds rigidly to two joints, without d and bounds.
 
-    The joint `skull/jaw` is midway between the condyles and has one key per frame.
-
-    Args:
-        out: File to write, in the folder of `geo.usdc`.
-        mesh_names: The meshes in `geo.usdc`, names as in `MESH_PATHS`.
-        frames: Increasing frame numbers (F,); None leaves the teeth closed.
-        d: Parameters (F, 3) [mm]; rows with NaN get no key.
-        prim_name: Name of the actor's prim, and prefix of the joint names.
+    The joint `skull/jaw` is midway between the condyles and has one key per frame (F,) with d (F, 3) [mm], none where d
+    is NaN; without frames, the teeth stay closed. Names of meshes are those of `MESH_PATHS`. Names of joints begin with
+    that of the actor's prim.
 
     Raises:
         OutputError: The file cannot be written.
@@ -122,15 +116,15 @@ def _define_motion(stage: Usd.Stage, rig: JawRig, frames: ArrayLike | None, d: A
     motion.CreateScalesAttr(Vt.Vec3hArray([(1, 1, 1)]))
     translations, rotations = motion.CreateTranslationsAttr(), motion.CreateRotationsAttr()
     translations.Set(layers.vec3f_array(_hinge(rig)[None, :3, 3]))
-    rotations.Set(layers.quatf_arrays(np.eye(4)[None])[0])
+    rotations.Set(Vt.QuatfArray([Gf.Quatf(1.0)]))
     if frames is None or d is None:
         return None
     frames, d = np.asarray(frames, dtype=np.float64), np.asarray(d, dtype=np.float64)
     known = np.isfinite(d).all(axis=1)
     joint = joint_poses(rig, d[known])
-    for frame, T, rotation in zip(frames[known].tolist(), joint, layers.quatf_arrays(joint), strict=True):
+    for frame, T, rotation in zip(frames[known].tolist(), joint, layers.rotations(joint), strict=True):
         translations.Set(layers.vec3f_array(T[None, :3, 3]), frame)
-        rotations.Set(rotation, frame)
+        rotations.Set(Vt.QuatfArray([Gf.Quatf(rotation)]), frame)
     return frames[known] if known.any() else None
 
 
@@ -173,31 +167,24 @@ class Bones:
             for attribute in (animation.GetTranslationsAttr(), animation.GetRotationsAttr(), animation.GetScalesAttr())
         ]
 
-    def poses(self, actor: Usd.Prim, times: Iterable[Usd.TimeCode], path: object) -> Array:
-        """Return the transforms (n, 4, 4) [mm] from the meshes' own frame to the actor's frame at n times.
-
-        Raises:
-            FormatError: A mesh is deformed, not bound, or moves differently from the others.
-        """
+    def poses(self, actor: Usd.Prim, times: Iterable[Usd.TimeCode]) -> Array:
+        """Return transforms (n, 4, 4) [mm] from meshes to actor at n times; raise FormatError if deformed or apart."""
         for mesh in layout.meshes_below(self._prim):
             if mesh.GetPath() not in {skinning.GetPrim().GetPath() for skinning, _ in self._bound}:
                 raise FormatError(
-                    f"bones move other meshes of {self._prim.GetPath()}, but not {mesh.GetPath()}.",
-                    path=str(path),
-                    hint=_BIND_RIGIDLY,
+                    f"bones move other meshes of {self._prim.GetPath()}, but not {mesh.GetPath()}.", hint=_BIND_RIGIDLY
                 )
         for skinning, _ in self._bound:
             if not skinning.IsRigidlyDeformed() or skinning.HasBlendShapes():
                 raise FormatError(
                     f"bones or blend shapes deform {skinning.GetPrim().GetPath()}: only rigid motion can be read.",
-                    path=str(path),
                     hint=_BIND_RIGIDLY,
                 )
         moved = np.array([[self._pose(*pair, actor, time) for time in times] for pair in self._bound])
         difference = np.abs(moved - moved[:1]).max(axis=(1, 2, 3))
         if not difference.max() <= SAME_MOTION:
             paths = [str(self._bound[i][0].GetPrim().GetPath()) for i in (0, int(np.argmax(difference)))]
-            raise FormatError(f"bones move {paths[0]} and {paths[1]} differently.", path=str(path), hint=_BIND_RIGIDLY)
+            raise FormatError(f"bones move {paths[0]} and {paths[1]} differently.", hint=_BIND_RIGIDLY)
         first: Array = moved[0]
         return first
 

@@ -6,7 +6,6 @@ the rig are therefore identified by their number of vertices, or of distinct pos
 
 from __future__ import annotations
 
-import os
 from typing import NamedTuple
 
 import numpy as np
@@ -14,7 +13,7 @@ from numpy.typing import NDArray
 from pxr import Sdf, Usd, UsdGeom, UsdSkel, Vt
 
 from jawusd.base.arrays import Array
-from jawusd.base.errors import FormatError
+from jawusd.base.errors import AnyPath, FormatError
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry.points import match_points, rigid_fit
 from jawusd.geometry.se3 import se3_inverse, transform_points
@@ -43,7 +42,7 @@ class StagePoses(NamedTuple):
     meshes: tuple[str, str]  # paths of the fitted prims of skull and mandible
 
 
-def carries_rig(path: str | os.PathLike[str], prim_path: str | None = None) -> bool:
+def carries_rig(path: AnyPath, prim_path: str | None = None) -> bool:
     """Return whether a stage has a rig whose mandible is moved by transforms or bones, so that no fit is needed.
 
     Raises:
@@ -58,13 +57,9 @@ def carries_rig(path: str | os.PathLike[str], prim_path: str | None = None) -> b
     return bool(rigs) and not any(mesh.GetPointsAttr().ValueMightBeTimeVarying() for mesh in meshes)
 
 
-@raises_format_error(0)
+@raises_format_error
 def fit_poses_of_stage(
-    path: str | os.PathLike[str],
-    actor: str | os.PathLike[str],
-    mandible: str | None = None,
-    skull: str | None = None,
-    rig_prim: str | None = None,
+    path: AnyPath, actor: AnyPath, mandible: str | None = None, skull: str | None = None, rig_prim: str | None = None
 ) -> StagePoses:
     """Fit the meshes of an actor to a stage, which moves copies of them in any way, at every whole frame.
 
@@ -80,8 +75,8 @@ def fit_poses_of_stage(
     """
     stage = open_stage(path)
     rest = read_geometry(actor, rig_prim, placeholders=True) | read_geometry(actor, rig_prim)
-    places = [_find(stage, rest, names, below, path) for names, below in ((_SKULL, skull), (_MANDIBLE, mandible))]
-    frames = frames_of_stage(stage, path)
+    places = [_find(stage, rest, names, below) for names, below in ((_SKULL, skull), (_MANDIBLE, mandible))]
+    frames = frames_of_stage(stage)
     fitted, misfit_mm = np.empty((2, len(frames), 4, 4)), 0.0
     for k, frame in enumerate(frames.tolist()):
         seen = [place.points(Usd.TimeCode(frame)) for place in places]
@@ -95,7 +90,6 @@ def fit_poses_of_stage(
         raise FormatError(
             f"its meshes {places[0].path} and {places[1].path} are up to {misfit_mm:.2f} mm from those of the rig; "
             f"at most {_MAX_MISFIT_MM} mm is allowed: they are other meshes, or deformed.",
-            path=str(path),
             hint="Choose the prims of skull and mandible with --skull and --mandible.",
         )
     T = se3_inverse(fitted[0]) @ fitted[1]
@@ -134,14 +128,12 @@ class _StageMesh:
         return np.array(points, dtype=np.float64)[self._chosen] @ M[:3, :3] + M[3, :3]
 
 
-def _find(
-    stage: Usd.Stage, rest: dict[str, Mesh], names: tuple[str, ...], below: str | None, path: object
-) -> _StageMesh:
+def _find(stage: Usd.Stage, rest: dict[str, Mesh], names: tuple[str, ...], below: str | None) -> _StageMesh:
     """Return the mesh of the stage that matches one of the named meshes of the rig, preferring teeth to bone."""
     if below is not None and not (Sdf.Path.IsValidPathString(below) and stage.GetPrimAtPath(below)):
-        raise FormatError(f"has no prim {below}.", path=str(path))
+        raise FormatError(f"has no prim {below}.")
     meshes = meshes_below(stage.GetPrimAtPath(below) if below is not None else stage.GetPseudoRoot())
-    found = {str(prim.GetPath()): _used_points(prim, path) for prim in meshes}
+    found = {str(prim.GetPath()): _used_points(prim) for prim in meshes}
     wanted = {name: rest[name] for name in names if name in rest}
     ambiguous: list[str] = []
     for name, mesh in wanted.items():
@@ -155,14 +147,12 @@ def _find(
     if ambiguous:
         raise FormatError(
             f"has several meshes with the vertices of the rig's {next(iter(wanted))}: {', '.join(ambiguous)}.",
-            path=str(path),
             hint="Choose the prims of one actor with --skull and --mandible.",
         )
     sizes = " or ".join(f"{len(mesh.vertices)} ({name})" for name, mesh in wanted.items())
     where = f" below {below}" if below is not None else ""
     raise FormatError(
         f"has no mesh{where} with as many vertices as in the rig: {sizes}.",
-        path=str(path),
         hint="Choose the prims of skull and mandible with --skull and --mandible. Export without merging vertices.",
     )
 
@@ -175,10 +165,10 @@ class _Points(NamedTuple):
     distinct: int
 
 
-def _used_points(prim: Usd.Prim, where: object) -> _Points:
+def _used_points(prim: Usd.Prim) -> _Points:
     mesh, first = UsdGeom.Mesh(prim), Usd.TimeCode.EarliestTime()
-    points = np.array(value_of(mesh.GetPointsAttr(), where, first) or np.empty((0, 3)), dtype=np.float64)
-    used = np.unique(np.array(value_of(mesh.GetFaceVertexIndicesAttr(), where, first) or [], dtype=np.int64))
+    points = np.array(value_of(mesh.GetPointsAttr(), first) or np.empty((0, 3)), dtype=np.float64)
+    used = np.unique(np.array(value_of(mesh.GetFaceVertexIndicesAttr(), first) or [], dtype=np.int64))
     used = used[used < len(points)]
     return _Points(points, used, len(np.unique(points[used], axis=0)))
 

@@ -35,11 +35,7 @@ _POINTS = 40  # number of mandible points at which the curvature is measured
 
 
 def valid_box(rig: JawRig) -> Array:
-    """Return the box (3, 2) [mm] of d that the table spans: `d_range`, widened to contain all valid d.
-
-    Raises:
-        RigError: The bounds allow no parameters.
-    """
+    """Return the box (3, 2) [mm] of the table: `d_range`, widened to all valid d; raise RigError if none is valid."""
     box = np.array(rig.d_range, dtype=np.float64)
     reach = 1.0 + rig.bound.offset_mm + rig.bound.softness_mm
     wide = box + np.array([-reach, reach])
@@ -115,11 +111,7 @@ def _curvature(rig: JawRig, box: Array, points: Array, axis: int) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class DecoderTable:
-    """Twists sampled over d.
-
-    Raises:
-        ValueError: Shapes that do not match, or values that do not increase.
-    """
+    """Twists sampled over d; ValueError is raised if shapes do not match or values do not increase."""
 
     format: str  # "grid" (twists over the three axes) or "curves" (three curves that are summed)
     axes: tuple[Array, Array, Array]  # values of d1, d2, d3 [mm], each array increasing

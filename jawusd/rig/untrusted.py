@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
+import os
 import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -10,7 +12,7 @@ from typing import NamedTuple, ParamSpec, TypeVar
 
 from pxr import Ar, Sdf, Tf, Usd
 
-from jawusd.base.errors import FormatError, RigError
+from jawusd.base.errors import FormatError, RigError, naming_file
 from jawusd.base.guard import most_cpu, note_input, out_of_memory
 from jawusd.base.inputs import is_allowed
 from jawusd.rig.asset_paths import (
@@ -58,22 +60,24 @@ _MAX_LAYER_READS = 20_000  # maximum number of reads; a layer is read once for e
 _RIG_ATTRIBUTES = ("jaw:formatVersion", "jaw:model", "jaw:bounds", "jaw:decoder")
 
 
-def raises_format_error(argument: int) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """Return a decorator that turns errors from values of unexpected types in the file `argument` into FormatError."""
+def raises_format_error(function: Callable[P, R]) -> Callable[P, R]:
+    """Decorate a reader of a stage: values of unexpected types raise FormatError.
 
-    def decorate(function: Callable[P, R]) -> Callable[P, R]:
-        @functools.wraps(function)
-        def wrapped(*args: P.args, **named: P.kwargs) -> R:
+    If its first argument is the path of a file, errors without a path get that one.
+    """
+
+    @functools.wraps(function)
+    def wrapped(*args: P.args, **named: P.kwargs) -> R:
+        path = args[0] if args and isinstance(args[0], str | os.PathLike) else None
+        with contextlib.nullcontext() if path is None else naming_file(path):
             try:
                 return function(*args, **named)
             except MemoryError as error:
-                raise out_of_memory(str(args[argument])) from error
+                raise out_of_memory(path) from error
             except VALUE_ERRORS as error:
-                raise FormatError(value_error_message(error), path=str(args[argument])) from error
+                raise FormatError(value_error_message(error)) from error
 
-        return wrapped
-
-    return decorate
+    return wrapped
 
 
 def value_error_message(error: BaseException) -> str:
@@ -83,11 +87,7 @@ def value_error_message(error: BaseException) -> str:
 
 
 def open_checked(path: Path) -> Usd.Stage:
-    """Open a stage after checking the files it refers to.
-
-    Raises:
-        RigError: The file is not USD, or refers to files that `check_file_access` rejects.
-    """
+    """Open a stage; raise RigError if it is not USD, or refers to files that `check_file_access` rejects."""
     note_input(path)
     try:
         with most_cpu(MAX_CPU_S):
@@ -161,11 +161,7 @@ def _checked_layers(path: Path) -> list[Sdf.Layer]:
 
 
 def check_composed(stage: Usd.Stage, checked: list[Sdf.Layer]) -> None:
-    """Check that a stage is composed only of layers returned by `check_file_access`.
-
-    Raises:
-        RigError: The stage is composed of other layers.
-    """
+    """Raise RigError if a stage is composed of layers that `check_file_access` did not return."""
     known = {file_of_layer(layer).resolve() for layer in checked}
     for layer in stage.GetUsedLayers():
         if not layer.anonymous and file_of_layer(layer).resolve() not in known:

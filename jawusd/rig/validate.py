@@ -13,7 +13,7 @@ from pathlib import Path
 
 from pxr import Sdf, Usd
 
-from jawusd.base.errors import RigError
+from jawusd.base.errors import AnyPath, RigError
 from jawusd.rig.layout import rig_prims
 from jawusd.rig.read import open_stage
 from jawusd.rig.rules import RULES, Finding, Rule
@@ -47,7 +47,7 @@ def register_validators() -> bool:
     return True
 
 
-def validate_stage(path: str | os.PathLike[str]) -> list[Finding]:
+def validate_stage(path: AnyPath) -> list[Finding]:
     """Return the findings of UsdValidation and, for rigs, of jawusd's own rules about a USD file.
 
     Raises:
@@ -105,7 +105,7 @@ def find_nvidia_validator() -> Path | None:
     return Path(found) if found else None
 
 
-def nvidia_findings(path: str | os.PathLike[str], program: Path) -> list[Finding]:
+def nvidia_findings(path: AnyPath, program: Path) -> list[Finding]:
     """Return the findings of NVIDIA's validator, a program from `find_nvidia_validator`, with its default rules.
 
     Raises:

@@ -40,7 +40,7 @@ from jawusd.rig import load_rig
 from jawusd.rig.animation import write_animation
 from jawusd.rig.bake import bake_rig
 from jawusd.rig.onnx_sidecar import decode_model
-from jawusd.rig.rules import check_bounds
+from jawusd.rig.rules import RULES
 from jawusd.solvers import JawLayer
 from jawusd.viewer.plots import solve_html
 from jawusd.viewer.pose_panel import verdict_html
@@ -254,7 +254,7 @@ def test_report_of_a_build():
 def test_usd_rule(actor, tmp_path):
     write_animation(tmp_path / "anim.usda", actor, np.arange(COUNT), D, FPS)
     stage = Usd.Stage.Open(str(tmp_path / "anim.usda"))
-    (finding,) = check_bounds(stage.GetPrimAtPath("/Actor"))
+    (finding,) = RULES["Bounds"](stage.GetPrimAtPath("/Actor"))
     assert finding.message.startswith(f"{(~INSIDE).sum()} of {COUNT} samples are outside")
 
 

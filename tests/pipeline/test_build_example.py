@@ -104,7 +104,7 @@ def test_exact_model_table_and_onnx_agree_on_random_valid_parameters(built):
     from jawusd.rig.read import find_rig_prim, open_stage, read_table
 
     stage = open_stage(out / "actor.usda")
-    table = read_table(find_rig_prim(stage, out), out)
+    table = read_table(find_rig_prim(stage, out))
     from jawusd.geometry import se3_exp
 
     read = se3_exp(table.twist(d)) @ rig.T_rest

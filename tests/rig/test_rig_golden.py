@@ -53,7 +53,7 @@ def test_onnx_graph_gives_the_golden_poses(golden):
 def test_table_is_as_near_to_the_golden_poses_as_it_says(golden):
     folder, d, poses, margins = golden
     stage = Usd.Stage.Open(str(folder / "actor.usda"))
-    table = read_table(find_rig_prim(stage, folder), folder)
+    table = read_table(find_rig_prim(stage, folder))
     rig = load_rig(folder / "actor.usda")
     inside = margins >= 0
     assert inside.sum() >= 5

@@ -63,7 +63,7 @@ def test_reading_twice_on_one_stage_upgrades_once(older):
     stage = Usd.Stage.Open(str(older / "actor.usda"))
     prim = stage.GetPrimAtPath("/Actor")
     for _ in range(2):
-        attributes.upgrade_rig(prim, older)
+        attributes.upgrade_rig(prim)
         assert prim.GetAttribute("jaw:formatVersion").Get() == NEXT
     np.testing.assert_allclose(prim.GetAttribute("jaw:model:incisor").Get(), example_rig().arrays["incisor"])
 

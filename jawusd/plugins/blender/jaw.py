@@ -54,7 +54,8 @@ def link_rigs(stage: Usd.Stage, prim_map: PrimMap) -> bool:
             continue
         actor[SOURCE] = _source_of(prim)
         actor[FPS] = stage.GetTimeCodesPerSecond()
-        rig = vendored_usd.rig_of(prim, actor[SOURCE])
+        with vendored.naming_file(actor[SOURCE]):
+            rig = vendored_usd.rig_of(prim)
         actor[_STORE] = _text_of(rig)
         values = [prim.GetAttribute(f"jaw:{name}").Get() or 0.0 for name in vendored.PARAMETERS]
         _add_sliders(actor, rig, values)
@@ -105,11 +106,7 @@ def meshes_of(mandible: bpy.types.Object) -> list[bpy.types.Object]:
 
 
 def rig_of(actor: bpy.types.Object) -> vendored.JawRig:
-    """Return the evaluator of an actor; it is cached under the text of the rig that is stored in the actor.
-
-    Raises:
-        vendored.JawusdError: The rig was stored by an older version of the add-on.
-    """
+    """Return the evaluator of an actor, cached by its stored text; raise JawusdError if an older add-on stored it."""
     text = actor[_STORE]
     if text not in _rigs:
         if text.startswith("{"):

@@ -3,6 +3,7 @@
 
 from jawusd.base.arrays import Array as Array
 from jawusd.base.errors import JawusdError as JawusdError
+from jawusd.base.errors import naming_file as naming_file
 from jawusd.evaluator import JawRig as JawRig
 from jawusd.geometry.se3 import transform_point as transform_point
 from jawusd.geometry.so3 import continuous_wxyz as continuous_wxyz
