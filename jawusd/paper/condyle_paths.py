@@ -117,11 +117,7 @@ def sagittal_section(mesh: Mesh, centre: Array, around_mm: float) -> Array:
 
 
 def path_distances(paths: list[CondylePath], captured: Array, d: Array) -> list[Distances]:
-    """Measure the paths against the captured condyles.
-
-    Args:
-        captured: condyle centres of the captured poses [mm], shape (2, N, 3).
-        d: parameters of the captured poses in the default model [mm], shape (N, 3).
+    """Measure the paths against the captured condyles (2, N, 3) [mm], whose d in the default model are (N, 3) [mm].
 
     Returns:
         For each path, the distances of its points from the nearest captured condyle centre during pure opening, and

@@ -166,11 +166,7 @@ class RasterCounter:
         self._pool = ThreadPoolExecutor(threads) if threads > 1 else None
 
     def show(self, matrices: Array, masks: Mask) -> None:
-        """Set the masks (C, h, w) of one frame, and the matrices (C, 3, 4) from world [mm] to homogeneous px.
-
-        Raises:
-            ValueError: the shapes do not agree.
-        """
+        """Set masks (C, h, w) of a frame and matrices (C, 3, 4), world [mm] to pixels, or raise ValueError."""
         checked_screens(matrices, masks)
         self._matrices = np.asarray(matrices, np.float64)
         self._width = masks.shape[2]
@@ -196,11 +192,7 @@ class RasterCounter:
 
 
 def checked_screens(matrices: Array, masks: Mask) -> None:
-    """Check that matrices are (C, 3, 4) and masks (C, h, w) with C, h, w > 0.
-
-    Raises:
-        ValueError: a shape is different.
-    """
+    """Raise ValueError unless matrices are (C, 3, 4) and masks (C, h, w) with C, h, w > 0."""
     views = len(matrices)
     if np.shape(matrices) != (views, 3, 4) or np.ndim(masks) != 3 or len(masks) != views or 0 in np.shape(masks):
         raise ValueError(

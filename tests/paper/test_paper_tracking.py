@@ -13,8 +13,7 @@ from jawusd.formats.mesh import Mesh
 from jawusd.formats.tracks import LOST, PARTIAL, TRACKED, load_tracks, save_tracks
 from jawusd.geometry import make_transform, transform_point, transform_points
 from jawusd.paper.energy import PaperEnergy, RasterCounter, paper_scan
-from jawusd.paper.solver import PaperConfig, golden_section, solve_paper
-from jawusd.paper.take import track_capture_paper
+from jawusd.paper.take import PaperConfig, golden_section, solve_paper, track_capture_paper
 from jawusd.tracking.contour.views import View
 
 RED, GREEN, GREY = (215, 45, 40), (40, 200, 60), (150, 150, 150)

@@ -16,8 +16,7 @@ from report import Origin, table, title
 from jawusd.formats.capture import Bootstrap, Capture, Pick, PickView, load_capture
 from jawusd.formats.mesh import Mesh, crown_face_mask, tooth_labels
 from jawusd.geometry import Camera, make_transform, rigid_fits, se3_inverse, transform_points
-from jawusd.paper.solver import PaperConfig
-from jawusd.paper.take import track_capture_paper
+from jawusd.paper.take import PaperConfig, track_capture_paper
 from jawusd.pipeline.cameras import load_cameras
 from jawusd.pipeline.subject import load_meshes, subject_of_capture
 from jawusd.tracking import track_capture
