@@ -51,11 +51,9 @@ class ForwardPass:
         trial = attempts.without_wrong_masks(trial, expected, instant)
         if not attempts.bad(trial).any():
             return attempts.judged(trial, instant)
-        for start in self._other_starts(trial, expected, instant):
-            around = replace(expected, pose=start)
-            other = attempts.attempt(start, around, instant, instant.present, config.wide_gates_px)
-            if other.objective(config.uncovered_price) > trial.objective(config.uncovered_price):
-                trial = other
+        trial = self._best_of([expected.pose, self._motion.last], trial, expected, instant)
+        if attempts.bad(trial).any():
+            trial = self._best_of(self._far_starts(trial, expected, instant), trial, expected, instant)
         fit = attempts.judged(trial, instant)
         if not fit.found.any():
             return replace(fit, pose=expected.pose)
@@ -65,8 +63,17 @@ class ForwardPass:
         alone = attempts.attempt(expected.pose, expected, instant, fit.use, config.wide_gates_px)
         return attempts.judged(alone, instant)
 
-    def _other_starts(self, trial: Trial, expected: Expected, instant: Instant) -> list[Pose]:
-        """Return further starts: the prediction, the last pose, and the best of jaw poses over the whole range.
+    def _best_of(self, starts: Sequence[Pose], trial: Trial, expected: Expected, instant: Instant) -> Trial:
+        """Return the best alignment from the start poses, or the given one if it is better."""
+        attempts, config = self._attempts, self._attempts.config
+        others = [
+            attempts.attempt(start, replace(expected, pose=start), instant, instant.present, config.wide_gates_px)
+            for start in starts
+        ]
+        return max(trial, *others, key=lambda one: one.objective(config.uncovered_price))
+
+    def _far_starts(self, trial: Trial, expected: Expected, instant: Instant) -> list[Pose]:
+        """Return the best of start poses with the jaw over its whole range.
 
         An arch of the trial that fits stays in place; else the expected head is moved onto the masks.
         """
@@ -76,8 +83,7 @@ class ForwardPass:
             poses = [self._coordinates.with_jaw(trial.pose, d, int(fitting[0])) for d in jaws]
         else:
             poses = [self._onto_masks(replace(expected.pose, d=d), instant) for d in jaws]
-        best = self._attempts.best_starts(poses, expected.precision, instant)
-        return [expected.pose, self._motion.last, *best]
+        return self._attempts.best_starts(poses, expected.precision, instant)
 
     def _onto_masks(self, pose: Pose, instant: Instant) -> Pose:
         """Return the pose, moved in the image so that an arch is centred on its masks."""
