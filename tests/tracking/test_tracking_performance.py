@@ -33,7 +33,7 @@ def test_slopes_are_what_steps_do(jaw, scans, truth):
     before = coordinates.arches(pose)
     for k, unit in enumerate(1e-5 * np.eye(LOCAL)):
         after = coordinates.arches(coordinates.moved(pose, unit))
-        for r, slope in enumerate(coordinates.slopes(pose)):
+        for r, slope in enumerate(coordinates.slopes(pose).arches):
             centre = transform_point(before[r], scans[r].centre)
             np.testing.assert_allclose(slope[:, k], twist_between(before[r], after[r], centre) / 1e-5, atol=2e-4)
 

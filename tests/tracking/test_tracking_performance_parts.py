@@ -207,7 +207,7 @@ def test_an_error_of_the_rig_moves_d_as_in_a_least_squares_fit(jaw, fixed_head):
         return np.concatenate([root @ move @ twist for root, move, twist in zip(roots, about, twists)])
 
     found = scipy.optimize.least_squares(residual, np.zeros(3 if fixed_head else 9), x_scale="jac", xtol=1e-14).x[-3:]
-    slopes = coordinates.slopes(pose)
+    slopes = coordinates.slopes(pose).arches
     matrix = sum(slope.T @ root.T @ root @ slope for slope, root in zip(slopes, roots))
     gain = rig_gain(coordinates, pose, matrix, roots[1].T @ roots[1], fixed_head=fixed_head)
     np.testing.assert_allclose(gain @ error, found, rtol=2e-3, atol=1e-7)
@@ -219,12 +219,11 @@ def test_a_misfit_is_eliminated_as_the_full_system_would(jaw):
     coordinates = Coordinates(jaw, [SimpleNamespace(centre=np.array([0.0, y, -9.0])) for y in (4.0, -6.0)])
     pose = Pose(np.eye(4), np.array([8.0, 1.0, 0.5]), rng.normal(size=6) * 0.01)
     root, slope = rng.normal(size=(9, 6)), rng.normal(size=(6, unknowns))
-    precision, error = root.T @ root, coordinates.error_slope(pose)
+    precision, error = root.T @ root, coordinates.slopes(pose).error
     gradient, of_rig = rng.normal(size=6), np.diag(rng.uniform(0.1, 1.0, 6))
     coupling, left = precision @ slope, rng.normal(size=unknowns)
     own = slope.T @ coupling + np.eye(unknowns)
-    coordinates.rig_error = of_rig
-    misfit = Misfit(coordinates, pose, (precision, gradient), coupling)
+    misfit = Misfit(of_rig, error, pose.misfit, (precision, gradient), coupling)
     step = np.linalg.solve(own + misfit.matrix, left + misfit.right)
     cross = coupling.T @ error
     full = np.block([[own, cross], [cross.T, error.T @ precision @ error + np.linalg.inv(of_rig)]])

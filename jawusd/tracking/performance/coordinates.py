@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -36,6 +37,15 @@ class Pose:
     d: Array  # jaw parameters [mm], shape (3,)
     # part of the mandible's pose that the rig cannot reproduce: a left twist in the skull frame [rad, mm], shape (6,)
     misfit: Array = field(default_factory=lambda: np.zeros(6))
+
+
+class Slopes(NamedTuple):
+    """Derivatives of left world twists of the arches about the centres of their crowns."""
+
+    arches: tuple[Array, Array]  # of the upper and lower arch, with respect to the unknowns, shape (6, 9) each
+    # of the lower arch, with respect to a left twist of the mandible's pose in the skull frame, such as the error of
+    # `JawRig.pose_covariance`, shape (6, 6)
+    error: Array
 
 
 class Coordinates:
@@ -74,28 +84,17 @@ class Coordinates:
         back = self.arches(pose)[arch] @ se3_inverse(self.arches(moved)[arch])
         return replace(moved, head=orthonormalise(back @ pose.head))
 
-    def slopes(self, pose: Pose) -> tuple[Array, Array]:
-        """Return the derivatives of both arches' left world twists with respect to the unknowns, shape (6, 9) each.
-
-        The twists are about the centres of the crowns.
-        """
+    def slopes(self, pose: Pose) -> Slopes:
+        """Return the derivatives of both arches' twists with respect to the unknowns and to an error of the rig."""
         relative = self.jaw.pose(pose.d)
         turn = se3_adjoint(make_transform(pose.head[:3, :3], np.zeros(3)))
         upper, lower = np.zeros((6, LOCAL)), np.zeros((6, LOCAL))
         upper[:, HEAD] = turn
         centre = transform_point(relative, self._lower_centre)
         lower[:, HEAD] = turn @ se3_adjoint(make_transform(np.eye(3), self.pivot - centre))
-        lower[:, JAW] = self.error_slope(pose) @ self.jaw.spatial_jacobian(pose.d)
-        return upper, lower
-
-    def error_slope(self, pose: Pose) -> Array:
-        """Return the derivative (6, 6) of the lower arch's world twist, as in `slopes`, with respect to a rig error.
-
-        The error is a left twist of the mandible's pose in the skull frame; see `JawRig.pose_covariance`.
-        """
-        centre = transform_point(self.jaw.pose(pose.d), self._lower_centre)
-        turn = make_transform(pose.head[:3, :3], np.zeros(3))
-        return se3_adjoint(turn @ make_transform(np.eye(3), -centre))
+        error = turn @ se3_adjoint(make_transform(np.eye(3), -centre))
+        lower[:, JAW] = error @ self.jaw.spatial_jacobian(pose.d)
+        return Slopes((upper, lower), error)
 
     def moved(self, pose: Pose, step: Array) -> Pose:
         """Return a pose after a step of the nine unknowns, shape (9,)."""

@@ -55,20 +55,24 @@ class Misfit:
 
     def __init__(
         self,
-        coordinates: Coordinates,
-        pose: Pose,
+        rig_error: Array,
+        slope: Array,
+        misfit: Array,
         sums: tuple[Array, Array],
         coupling: Array,
     ) -> None:
         """Eliminate the misfit at a pose.
 
         Args:
-            sums: precision (6, 6) and gradient (6,) of the lower arch's twist, as in `Coordinates.slopes`.
+            rig_error: its prior covariance, as in `Coordinates`, shape (6, 6).
+            slope: derivative of the lower arch's twist with respect to it, `Slopes.error`, shape (6, 6).
+            misfit: misfit of the pose, shape (6,).
+            sums: precision (6, 6) and gradient (6,) of the lower arch's twist, as in `Slopes`.
             coupling: block of the normal matrix that couples this twist with the unknowns, shape (6, N).
         """
         precision, gradient = sums
-        self._slope, self._coupling = coordinates.error_slope(pose), coupling
-        prior, offset = self._slope @ coordinates.rig_error @ self._slope.T, self._slope @ pose.misfit
+        self._slope, self._coupling = slope, coupling
+        prior, offset = slope @ rig_error @ slope.T, slope @ misfit
         kept = np.linalg.inv(np.eye(6) + precision @ prior)
         self.precision, self._spread = kept @ precision, prior @ kept
         self._gradient = gradient + precision @ offset  # at zero misfit
@@ -153,11 +157,13 @@ class InstantSolver:
         outline, slopes = state.outline, self.coordinates.slopes(pose)
         precision = [outline_weight[r] * outline.precision[r].sum(0) for r in ARCHES]
         gradient = [outline_weight[r] * outline.gradient[r].sum(0) for r in ARCHES]
-        coupling = precision[1] @ slopes[1]
-        misfit = Misfit(self.coordinates, pose, (precision[1], gradient[1]), coupling)
+        upper, lower = slopes.arches
+        coupling = precision[1] @ lower
+        sums = precision[1], gradient[1]
+        misfit = Misfit(self.coordinates.rig_error, slopes.error, pose.misfit, sums, coupling)
         return Equations(
-            slopes[0].T @ precision[0] @ slopes[0] + slopes[1].T @ coupling + misfit.matrix,
-            slopes[0].T @ gradient[0] + slopes[1].T @ gradient[1] + misfit.right,
+            upper.T @ precision[0] @ upper + lower.T @ coupling + misfit.matrix,
+            upper.T @ gradient[0] + lower.T @ gradient[1] + misfit.right,
             misfit,
         )
 
@@ -195,8 +201,8 @@ def rig_gain(coordinates: Coordinates, pose: Pose, matrix: Array, lower: Array, 
     arch's twist, shape (6, 6), as in `Misfit`.
     """
     free = JAW if fixed_head else slice(0, LOCAL)
-    slope = coordinates.slopes(pose)[1][:, free]
-    gain = np.linalg.solve(matrix[free, free], slope.T @ lower @ coordinates.error_slope(pose))
+    slopes = coordinates.slopes(pose)
+    gain = np.linalg.solve(matrix[free, free], slopes.arches[1][:, free].T @ lower @ slopes.error)
     return np.asarray(gain[-3:], np.float64)
 
 

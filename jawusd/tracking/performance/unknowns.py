@@ -90,19 +90,20 @@ class Unknowns:
         matrix, right = np.zeros((size, size)), np.zeros(size)
         if bound_at is not None:
             matrix[:LOCAL, :LOCAL], right[:LOCAL] = bound_equations(self._coordinates, pose.d, bound_at)
-        for r, slope in zip(ARCHES, self._coordinates.slopes(pose), strict=True):
+        slopes = self._coordinates.slopes(pose)
+        for r, slope in zip(ARCHES, slopes.arches, strict=True):
             if solution is None or not found[r]:
                 continue
             sums = solution.outline
             to_twist, to_habit = np.zeros((6, size)), np.zeros((self._cameras, COMPONENTS, size))
             to_twist[:, :LOCAL], to_habit[..., bias] = slope, self._layers[r]
-            to_outline = np.einsum("chi,chn->in", sums.habit_slope[r], to_habit)
+            to_outline = np.tensordot(sums.habit_slope[r], to_habit, ((0, 1), (0, 1)))
             both = to_twist.T @ to_outline
-            own = np.einsum("chn,chk,ckm->nm", to_habit, sums.habit_weight[r], to_habit, optimize=True)
+            own = np.tensordot(to_habit, sums.habit_weight[r] @ to_habit, ((0, 1), (0, 1)))
             own += to_twist.T @ sums.precision[r].sum(0) @ to_twist
             matrix += weight[r] * (own + both + both.T)
             right += weight[r] * (
-                to_twist.T @ sums.gradient[r].sum(0) + np.einsum("chn,ch->n", to_habit, sums.habit_distance[r])
+                to_twist.T @ sums.gradient[r].sum(0) + np.tensordot(sums.habit_distance[r], to_habit, 2)
             )
             if fit.growth is not None and self.free_focal:
                 columns = slice(bias.stop, size)
@@ -115,7 +116,8 @@ class Unknowns:
             if r:
                 precision, gradient = weight[r] * sums.precision[r].sum(0), weight[r] * sums.gradient[r].sum(0)
                 coupling = precision @ to_twist + weight[r] * to_outline
-                misfit = Misfit(self._coordinates, pose, (precision, gradient), coupling)
+                prior = self._coordinates.rig_error
+                misfit = Misfit(prior, slopes.error, pose.misfit, (precision, gradient), coupling)
                 matrix += misfit.matrix
                 right += misfit.right
         if not self.fixed_head:
