@@ -13,7 +13,7 @@ from jawusd.formats.tracks import LOST
 from jawusd.geometry import se3_exp, transform_point
 from jawusd.tracking.follow import TwoWays
 from jawusd.tracking.initialization.footage import MaskSurvey
-from jawusd.tracking.initialization.start_search import _opened
+from jawusd.tracking.initialization.start_search import _OPENINGS_MM, _opened
 from jawusd.tracking.sequence.passes import LostSearch
 
 FRAMES = 13
@@ -89,5 +89,6 @@ def test_the_jaw_is_searched_where_condyles_slide_forward(front, condyles):
     """
     places = np.array([[0.0, 0.0, 0.0], [0.0, 40.0, -90.0]])
     moved = places + [[0.0, *front], [0.0, *condyles]]
-    off_mm = [np.linalg.norm(transform_point(T, places) - moved, axis=1).max() for T in _opened(places[:1], np.eye(4))]
+    jaws = _opened(places[:1], np.eye(4), _OPENINGS_MM)
+    off_mm = [np.linalg.norm(transform_point(T, places) - moved, axis=1).max() for T in jaws]
     assert min(off_mm) < 6.0

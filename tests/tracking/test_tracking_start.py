@@ -35,6 +35,7 @@ from jawusd.tracking.initialization import start as take_start
 from jawusd.tracking.initialization import start_search
 from jawusd.tracking.initialization.footage import Footage, MaskSurvey
 from jawusd.tracking.initialization.pose_search import (
+    Candidate,
     Grid,
     ShiftCorrelation,
     _template,
@@ -329,18 +330,33 @@ def test_search_is_the_same_in_threads(pictures, short_search):
     assert (both[0].poses == both[1].poses).all() and both[0].objective_px == both[1].objective_px
 
 
-def test_an_arch_shifted_by_a_tooth_is_corrected_by_the_other_one(pictures, monkeypatch):
+def _found(monkeypatch, search, *placed):
+    """Let a search find an upper and a lower arch that are moved aside by `placed` [mm], the best ones first."""
+
+    def searched(r, views, base, grid, most):
+        moves = [make_transform(np.eye(3), [mm[r], 0.0, 0.0]) for mm in placed[:most]]
+        return [Candidate(-k, jaw_poses(FRAMES)[0, r] @ move) for k, move in enumerate(moves)]
+
+    monkeypatch.setattr(search, "_searched", searched)
+    return search
+
+
+@pytest.mark.parametrize(
+    ("option", "off", "placed"),
+    [
+        ("_OPENINGS_MM", (), [(0.0, 7.5)]),  # a tooth
+        # the correct arches are found last
+        ("_PAIRS", 0, [(mm, -mm) for mm in (7.5, -7.5, 10.0, -10.0, 12.0, -12.0)] + [(0.0, 0.0)]),
+    ],
+)
+def test_arches_shifted_by_a_tooth_are_corrected_by_one_another(pictures, monkeypatch, option, off, placed):
     capture = _capture(pictures)
     solver = ContourSolver(SCANS, TrackingConfig())
     axes, _ = check_occlusion(SCANS, capture.anatomy.T_anatomical_skull)
-    search = StartSearch(MESHES, solver, axes)
     true = jaw_poses(FRAMES)[0]
-    aside = make_transform(np.eye(3), [7.5, 0.0, 0.0])  # mm: a tooth
-    monkeypatch.setattr(search, "_searched", lambda r, views, base, grid: [true[r] if r == 0 else true[r] @ aside])
     footage = Footage(masked_sources(capture.cameras, TABLE, OFFSETS), TABLE, OFFSETS, capture.frames)
-    found = search.at(footage, FIRST)
+    found = _found(monkeypatch, StartSearch(MESHES, solver, axes), *placed).at(footage, FIRST)
     assert [vertex_error_mm(MESHES[r], found.poses[r], true[r]) < 0.3 for r in (0, 1)] == [True, True]
-    monkeypatch.setattr(start_search, "_OPENINGS_MM", ())
-    alone = StartSearch(MESHES, solver, axes)
-    monkeypatch.setattr(alone, "_searched", lambda r, views, base, grid: [true[r] if r == 0 else true[r] @ aside])
-    assert vertex_error_mm(MESHES[1], alone.at(footage, FIRST).poses[1], true[1]) > 1.0
+    monkeypatch.setattr(start_search, option, off)
+    alone = _found(monkeypatch, StartSearch(MESHES, solver, axes), *placed).at(footage, FIRST)
+    assert vertex_error_mm(MESHES[1], alone.poses[1], true[1]) > 1.0

@@ -18,10 +18,21 @@ from jawusd.tracking.contour.scan import ARCH_NAMES, ARCHES, prepare_scan, teeth
 from jawusd.tracking.contour.solver import ContourSolver
 from jawusd.tracking.contour.views import View
 from jawusd.tracking.initialization.footage import Footage
-from jawusd.tracking.initialization.pose_search import Grid, coarse_scan, distinct, hinge_at_front, search_arch
+from jawusd.tracking.initialization.pose_search import (
+    Candidate,
+    Grid,
+    coarse_scan,
+    distinct,
+    hinge_at_front,
+    search_arch,
+)
 
 _PX_PER_MM = 2.0  # resolution: a pixel is a third of the motion of the canines between neighbouring orientations
 _FINALISTS = 5  # number of poses per arch that are refined
+# Number of poses per arch that are combined to pairs, number of pairs that are refined, and penalty for the squared
+# distance of the lower arch from its nearest position in a typical jaw [px/mm^2]. Arches that are shifted along
+# themselves by a tooth fit images from the sides almost as well as correct ones.
+_COMBINED, _PAIRS, _ATYPICAL_PRICE = 80, 16, 4.0
 _DISTINCT_MM = 2.0  # minimum distance of distinct poses [mm]: closer ones converge to the same local minimum
 # Rotations and translations around a guess in which the teeth face the cameras with the upper arch above the lower one.
 # Lateral movement and the lips mainly bias the roll of the guess. With retracted lips, the centre of the masks lies up
@@ -48,6 +59,7 @@ _OPENINGS_MM = (
     *((opening, 0.0, 0.0) for opening in (0.0, 6.0, 14.0, 24.0, 36.0)),
     *((14.0, -3.0, 4.0), (24.0, -6.0, 8.0), (36.0, -7.0, 11.5), (48.0, -8.0, 14.0)),
 )
+_TYPICAL_MM = [(mm, -slid * mm, 1.8 * slid * mm) for mm in np.arange(0.0, 50.0, 4.0) for slid in (0.0, 0.17)]
 _WIDEST_JAW_RAD = 0.8  # maximum rotation between the arches [rad]
 _FARTHEST_JAW_MM = 75.0  # maximum distance between the front teeth of the arches [mm]
 
@@ -83,7 +95,10 @@ class StartSearch:
         self._coarse = tuple(coarse_scan(m, n) for m, n in zip(meshes, ARCH_NAMES, strict=True))
         self._hinges = [hinge_at_front(s.crown_vertices(), T_anatomical_scan) for s in self._coarse]
         self._coarse_solver = ContourSolver(self._coarse, self._config)
-        self._jaws = _opened(self._coarse[1].crown_vertices(), T_anatomical_scan)
+        crowns, probes = self._coarse[1].crown_vertices(), self._coarse[1].probes
+        self._jaws = _opened(crowns, T_anatomical_scan, _OPENINGS_MM)
+        typical = _opened(crowns, T_anatomical_scan, _TYPICAL_MM)
+        self._typical = np.stack([transform_points(jaw, probes) for jaw in typical])
 
     def mirrored(self) -> StartSearch:
         """Return a search with mirrored scans, left and right exchanged."""
@@ -118,8 +133,9 @@ class StartSearch:
             views = masks.at(frame)
         axes = guessed_axes(places, survey.eyes)
         bases = [make_transform(axes, place) for place in places]
-        finalists = [self._searched(r, views, bases[r], _GRID) for r in ARCHES]
-        return self._settled(finalists, views, footage, frame)
+        found = [self._searched(r, views, bases[r], _GRID, _COMBINED) for r in ARCHES]
+        finalists = [[candidate.pose for candidate in some[:_FINALISTS]] for some in found]
+        return self._settled(finalists, self._typical_pairs(*found), views, footage, frame)
 
     def near(self, footage: Footage, frame: int, poses: Array) -> SearchResult:
         """Return the best poses in a frame, searched near given ones (2, 4, 4); raises TrackingError as `at` does."""
@@ -128,19 +144,36 @@ class StartSearch:
         finalists = []
         for r in ARCHES:
             base = poses[r] @ np.linalg.inv(self._hinges[r])
-            finalists.append([poses[r], *self._searched(r, views, base, _NEAR_GRID)])
-        return self._settled(finalists, views, footage, frame)
+            found = self._searched(r, views, base, _NEAR_GRID, _FINALISTS)
+            finalists.append([poses[r], *(candidate.pose for candidate in found)])
+        return self._settled(finalists, [], views, footage, frame)
 
-    def _searched(self, r: int, views: Sequence[View], base: Array, grid: Grid) -> list[Array]:
-        """Return the best poses of an arch that are distinct from one another."""
+    def _searched(self, r: int, views: Sequence[View], base: Array, grid: Grid, most: int) -> list[Candidate]:
+        """Return up to `most` poses of an arch that are distinct from one another, the best ones first."""
         found = search_arch(self._coarse[r], r, views, _PX_PER_MM, base, self._hinges[r], grid, self._map)
-        return [candidate.pose for candidate in distinct(found, self._coarse[r].probes, _DISTINCT_MM, _FINALISTS)]
+        return distinct(found, self._coarse[r].probes, _DISTINCT_MM, most)
+
+    def _typical_pairs(self, upper: Sequence[Candidate], lower: Sequence[Candidate]) -> list[Array]:
+        """Return the pairs of poses, shape (2, 4, 4) each, that fit best and are similar to those of typical jaws."""
+        jaws = np.stack([[se3_inverse(u.pose) @ v.pose for v in lower] for u in upper])
+        places = transform_points(jaws, self._coarse[1].probes)
+        atypical_mm = np.min([np.linalg.norm(places - one, axis=-1).mean(-1) for one in self._typical], axis=0)
+        fit = np.array([[u.objective + v.objective for v in lower] for u in upper])
+        order = np.argsort(_ATYPICAL_PRICE * atypical_mm**2 - fit, axis=None)[:_PAIRS]
+        return [
+            np.stack([upper[u].pose, lower[v].pose]) for u, v in zip(*np.unravel_index(order, fit.shape), strict=True)
+        ]
 
     def _settled(
-        self, finalists: Sequence[Sequence[Array]], views: Sequence[View], footage: Footage, frame: int
+        self,
+        finalists: Sequence[Sequence[Array]],
+        pairs: Sequence[Array],
+        views: Sequence[View],
+        footage: Footage,
+        frame: int,
     ) -> SearchResult:
-        """Return the best pair of finalists, refined at working resolution."""
-        pairs = self._refined_pairs(finalists, views)
+        """Return the best pair, of the finalists or of given pairs, refined at working resolution."""
+        pairs = self._refined_pairs(finalists, pairs, views)
         if not pairs:
             raise TrackingError("the best poses of the two arches are anatomically impossible", frame=frame)
         with footage.views(teeth_centre(self._coarse, pairs[0]), self._config.working_px_per_mm) as masks:
@@ -151,8 +184,10 @@ class StartSearch:
         fits = arch_fit(self.solver.scans, ends[best], views, self._config.uncovered_price)
         return SearchResult(ends[best].poses, float(objective[best]), fits)
 
-    def _refined_pairs(self, finalists: Sequence[Sequence[Array]], views: Sequence[View]) -> list[Array]:
-        """Refine the finalists coarsely; return up to four anatomically possible pairs, shape (2, 4, 4) each."""
+    def _refined_pairs(
+        self, finalists: Sequence[Sequence[Array]], together: Sequence[Array], views: Sequence[View]
+    ) -> list[Array]:
+        """Refine the finalists and pairs coarsely; return up to four anatomically possible pairs, shape (2, 4, 4)."""
 
         def ranked(r: int, poses: Sequence[Array], others: Array) -> list[tuple[float, Array]]:
             ends = []
@@ -167,6 +202,8 @@ class StartSearch:
         alone[0] += ranked(0, [lower @ se3_inverse(jaw) for jaw in self._jaws], lower)
         alone[1] += ranked(1, [upper @ jaw for jaw in self._jaws], upper)
         pairs = [(u[0] + v[0], np.stack([u[1], v[1]])) for u in alone[0] for v in alone[1]]
+        for end in (self._coarse_solver.solve(pair, views, self._config.wide_gates_px) for pair in together):
+            pairs.append((float(self._objective(self._coarse_solver, end, views).sum()), end.poses))
         pairs = [p for p in pairs if self._possible(p[1])]
         return [poses for _, poses in sorted(pairs, key=lambda p: -p[0])[:4]]
 
@@ -187,13 +224,13 @@ class StartSearch:
         return penalised_score_px(solution, uncovered, price).sum(1)
 
 
-def _opened(crowns: Array, T_anatomical_scan: Array) -> list[Array]:
-    """Return T_upper_lower (4, 4) of a closed and of opened jaws; `crowns` (N, 3) are those of the lower teeth."""
+def _opened(crowns: Array, T_anatomical_scan: Array, openings_mm: Sequence[tuple[float, float, float]]) -> list[Array]:
+    """Return T_upper_lower (4, 4) of jaws opened as in `_OPENINGS_MM`; `crowns` (N, 3) are those of the lower scan."""
     points = transform_points(T_anatomical_scan, crowns)
     up, front = _CONDYLES_MM
     hinge = points[points[:, 2].argmax()] * [0.0, 1.0, 1.0] + [0.0, up, front]
     out = []
-    for opening, slid_up, slid_front in _OPENINGS_MM:
+    for opening, slid_up, slid_front in openings_mm:
         turn = so3_exp(np.array([(opening + slid_up) / np.hypot(up, front), 0.0, 0.0]))
         moved = make_transform(turn, hinge - turn @ hinge + [0.0, slid_up, slid_front])
         out.append(se3_inverse(T_anatomical_scan) @ moved @ T_anatomical_scan)
