@@ -25,9 +25,10 @@ _UNLIKE, _REDDER, _DARKER = 0.6, 3.0, 0.3
 _LEAST_AREA, _MOST_AREA = 0.0015, 0.2  # minimum and maximum fraction of the image covered by teeth
 # radius of the morphological closing; inner and outer distance of the ring that samples the surroundings of teeth
 _CLOSE_PX, _NEAR_PX, _FAR_PX = 4, 3, 12
-# Maximum distance between the arches, in arch widths; minimum area of a part relative to an arch; minimum brightness
-# and contrast of a part relative to the teeth found first, above those of wet lips and chins.
-_ROWS_APART, _LEAST_PART, _AS_BRIGHT, _LIKE = 1.0, 0.02, 0.65, 0.5
+# Maximum distance between the arches along and across their columns, in widths of the one found first; wide-open
+# mouths need this much from the side, where arches look narrow. Minimum area of a part relative to an arch; minimum
+# brightness and contrast of a part relative to the teeth found first, above those of wet lips and chins.
+_ROWS_APART, _ROWS_ASIDE, _LEAST_PART, _AS_BRIGHT, _LIKE = 1.6, 0.4, 0.02, 0.65, 0.5
 # Candidate lines between the arches: tilts relative to half the width, sags relative to the height, and minimum
 # fraction of the tooth pixels on each side.
 _TILTS, _SAGS, _LEAST_SHARE = np.linspace(-0.3, 0.3, 21), np.linspace(-0.4, 0.4, 13), 0.2
@@ -153,10 +154,11 @@ def _group_contrast(
 def _parts_near(parts: NDArray[np.int32], group: Mask) -> list[int]:
     """Return the labels of the parts near a group of teeth whose size and position are those of teeth."""
     rows, columns = np.nonzero(group)
-    reach = _ROWS_APART * (np.ptp(columns) + 1)
+    width = np.ptp(columns) + 1
+    apart, aside = int(_ROWS_APART * width), int(_ROWS_ASIDE * width)
     around = np.zeros(parts.shape, bool)
-    across = np.s_[max(columns.min() - _CLOSE_PX, 0) : columns.max() + _CLOSE_PX + 1]
-    around[max(int(rows.min() - reach), 0) : int(rows.max() + reach), across] = True
+    across = np.s_[max(columns.min() - aside, 0) : columns.max() + aside + 1]
+    around[max(rows.min() - apart, 0) : rows.max() + apart, across] = True
     areas = np.bincount(parts.ravel())
     inside = np.bincount(parts.ravel(), around.ravel(), len(areas))
     kept = (inside > 0.8 * areas) & (areas > _LEAST_PART * ((parts > 0) & group).sum())

@@ -9,8 +9,11 @@ from jawusd.segmentation.rows import tooth_rows
 SKIN, LIP, DARK, TOOTH, GREY = (190, 140, 115), (150, 80, 75), (25, 12, 12), (225, 215, 195), (70, 80, 90)
 
 
-def mouth(opening_px, *, size=(360, 640), tint=(1.0, 1.0, 1.0), chin=SKIN):
-    """Return a drawn mouth, shape (H, W, 3), and the masks of both rows, shape (2, H, W)."""
+def mouth(opening_px, *, size=(360, 640), tint=(1.0, 1.0, 1.0), chin=SKIN, teeth=10, aside_px=0):
+    """Return a drawn mouth, shape (H, W, 3), and the masks of both rows, shape (2, H, W).
+
+    The lower row is moved to the right by `aside_px`.
+    """
     height, width = size
     picture = np.full((height, width, 3), SKIN, np.uint8)
     picture[:, : width // 8] = GREY
@@ -20,8 +23,8 @@ def mouth(opening_px, *, size=(360, 640), tint=(1.0, 1.0, 1.0), chin=SKIN):
     cv2.circle(picture, (x, y + 120), 25, chin, -1)
     masks = np.zeros((2, height, width), np.uint8)
     for row, top in enumerate((y - opening_px // 2 - 26, y + opening_px // 2)):
-        for tooth in range(-5, 5):
-            left = x + tooth * 20
+        for tooth in range(-(teeth // 2), teeth // 2):
+            left = x + tooth * 20 + row * aside_px
             cv2.rectangle(masks[row], (left + 1, top), (left + 18, top + 25), 255, -1)
     picture[(masks > 0).any(0)] = TOOTH
     noise = np.random.default_rng(3).normal(0, 4, picture.shape)
@@ -36,6 +39,14 @@ def overlap(one, other):
 @pytest.mark.parametrize("tint", [(1.0, 1.0, 1.0), (0.5, 0.45, 0.4), (1.0, 0.9, 0.7)])
 def test_rows_apart_are_told_from_one_another(opening_px, tint):
     picture, masks = mouth(opening_px, tint=tint, chin=(215, 170, 150))
+    found = tooth_rows(picture)
+    assert found is not None and found.bridged < 0.1
+    assert overlap(found.masks[0], masks[0]) > 0.75 and overlap(found.masks[1], masks[1]) > 0.75
+
+
+def test_narrow_rows_of_a_wide_open_mouth_belong_together():
+    """From the side, the mouth is taller than the visible teeth are wide, and the chin moves backwards."""
+    picture, masks = mouth(160, teeth=6, aside_px=40)
     found = tooth_rows(picture)
     assert found is not None and found.bridged < 0.1
     assert overlap(found.masks[0], masks[0]) > 0.75 and overlap(found.masks[1], masks[1]) > 0.75
