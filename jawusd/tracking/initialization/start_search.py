@@ -29,10 +29,11 @@ from jawusd.tracking.initialization.pose_search import (
 
 _PX_PER_MM = 2.0  # resolution: a pixel is a third of the motion of the canines between neighbouring orientations
 _FINALISTS = 5  # number of poses per arch that are refined
-# Number of poses per arch that are combined to pairs, number of pairs that are refined, and penalty for the squared
-# distance of the lower arch from its nearest position in a typical jaw [px/mm^2]. Arches that are shifted along
-# themselves by a tooth fit images from the sides almost as well as correct ones.
-_COMBINED, _PAIRS, _ATYPICAL_PRICE = 80, 16, 4.0
+# Number of poses per arch that are combined to pairs, number of pairs that are aligned by a few steps, number of these
+# that are refined, and penalty for the squared distance of the lower arch from its nearest position in a typical jaw
+# [px/mm^2]. Arches that are shifted along themselves by a tooth fit images from the sides almost as well as correct
+# ones.
+_COMBINED, _PAIRS, _REFINED, _ATYPICAL_PRICE = 80, 48, 4, 4.0
 _DISTINCT_MM = 2.0  # minimum distance of distinct poses [mm]: closer ones converge to the same local minimum
 # Rotations and translations around a guess in which the teeth face the cameras with the upper arch above the lower one.
 # Lateral movement and the lips mainly bias the roll of the guess. With retracted lips, the centre of the masks lies up
@@ -189,6 +190,11 @@ class StartSearch:
     ) -> list[Array]:
         """Refine the finalists and pairs coarsely; return up to four anatomically possible pairs, shape (2, 4, 4)."""
 
+        def aligned(starts: Sequence[Array], gates_px: Sequence[float]) -> list[tuple[float, Array]]:
+            ends = [self._coarse_solver.solve(pair, views, gates_px) for pair in starts]
+            found = [(float(self._objective(self._coarse_solver, end, views).sum()), end.poses) for end in ends]
+            return sorted(found, key=lambda pair: -pair[0])
+
         def ranked(r: int, poses: Sequence[Array], others: Array) -> list[tuple[float, Array]]:
             ends = []
             for pose in poses:
@@ -202,8 +208,8 @@ class StartSearch:
         alone[0] += ranked(0, [lower @ se3_inverse(jaw) for jaw in self._jaws], lower)
         alone[1] += ranked(1, [upper @ jaw for jaw in self._jaws], upper)
         pairs = [(u[0] + v[0], np.stack([u[1], v[1]])) for u in alone[0] for v in alone[1]]
-        for end in (self._coarse_solver.solve(pair, views, self._config.wide_gates_px) for pair in together):
-            pairs.append((float(self._objective(self._coarse_solver, end, views).sum()), end.poses))
+        together = [pair for _, pair in aligned(together, self._config.trial_gates_px)[:_REFINED]]
+        pairs += aligned(together, self._config.wide_gates_px)
         pairs = [p for p in pairs if self._possible(p[1])]
         return [poses for _, poses in sorted(pairs, key=lambda p: -p[0])[:4]]
 
