@@ -13,6 +13,7 @@ from jawusd.base.arrays import Array, Mask
 from jawusd.tracking.contour.equations import Solution
 from jawusd.tracking.contour.quality import (
     coverage_error,
+    fitting_share,
     matched_px,
     penalised_score_px,
     residual_px,
@@ -227,7 +228,7 @@ def empty_fit(pose: Pose, instant: Instant) -> FrameFit:
 def usual_of(fits: Iterable[FrameFit]) -> Usual:
     """Return the medians over the fits in which an arch was found; typical values if there is none."""
     listed = [
-        (residual_px(fit.solution), _mean_uncovered(fit), _share(fit.solution), fit.found)
+        (residual_px(fit.solution), _mean_uncovered(fit), fitting_share(fit.solution), fit.found)
         for fit in fits
         if fit.solution is not None
     ]
@@ -237,11 +238,6 @@ def usual_of(fits: Iterable[FrameFit]) -> Usual:
         return np.array([np.median(own) if own else typical for own in values])
 
     return Usual(*(median(k, typical) for k, typical in enumerate((_TYPICAL_PX, _TYPICAL_UNCOVERED, _TYPICAL_SHARE))))
-
-
-def _share(solution: Solution) -> Array:
-    """Return the matched fraction of the visible contour of each arch [-], shape (2,)."""
-    return np.asarray(score_px(solution).sum(1) / np.maximum(solution.visible_px.sum(1), 1.0))
 
 
 def _mean_uncovered(fit: FrameFit) -> Array:
