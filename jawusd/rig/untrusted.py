@@ -63,12 +63,13 @@ _RIG_ATTRIBUTES = ("jaw:formatVersion", "jaw:model", "jaw:bounds", "jaw:decoder"
 def raises_format_error(function: Callable[P, R]) -> Callable[P, R]:
     """Decorate a reader of a stage: values of unexpected types raise FormatError.
 
-    If its first argument is the path of a file, errors without a path get that one.
+    If its first argument is the `path` of a file, errors without a path get that one.
     """
 
     @functools.wraps(function)
     def wrapped(*args: P.args, **named: P.kwargs) -> R:
-        path = args[0] if args and isinstance(args[0], str | os.PathLike) else None
+        first = args[0] if args else named.get("path")
+        path = first if isinstance(first, str | os.PathLike) else None
         with contextlib.nullcontext() if path is None else naming_file(path):
             try:
                 return function(*args, **named)

@@ -209,6 +209,15 @@ def test_files_that_are_no_rig(tmp_path, anchored_folder):
         load_rig(anchored_folder / "geo.usdc")
 
 
+@pytest.mark.parametrize("by_keyword", [False, True])
+def test_errors_of_a_rig_name_its_file(anchored_folder, by_keyword):
+    path = anchored_folder / "actor.usda"
+    edit(anchored_folder / "rig.usdc", set_value("jaw:meta", "[1]"))
+    with pytest.raises(FormatError) as refusal:
+        load_rig(path=path) if by_keyword else load_rig(path)
+    assert refusal.value.path == str(path)
+
+
 def test_two_actors_in_a_shot_move_independently(folder, kind, tmp_path):
     shot = Usd.Stage.CreateInMemory()
     UsdGeom.SetStageUpAxis(shot, "Y")
