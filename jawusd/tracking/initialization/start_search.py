@@ -60,6 +60,7 @@ _OPENINGS_MM = (
     *((opening, 0.0, 0.0) for opening in (0.0, 6.0, 14.0, 24.0, 36.0)),
     *((14.0, -3.0, 4.0), (24.0, -6.0, 8.0), (36.0, -7.0, 11.5), (48.0, -8.0, 14.0)),
 )
+# Openings of typical jaws, by rotation alone and with condyles that slide forward in proportion.
 _TYPICAL_MM = [(mm, -slid * mm, 1.8 * slid * mm) for mm in np.arange(0.0, 50.0, 4.0) for slid in (0.0, 0.17)]
 _WIDEST_JAW_RAD = 0.8  # maximum rotation between the arches [rad]
 _FARTHEST_JAW_MM = 75.0  # maximum distance between the front teeth of the arches [mm]
