@@ -77,8 +77,8 @@ def test_transparency_is_the_mask(tmp_path, kind):
 def test_transparency_in_png_files_likewise(tmp_path):
     for k in range(COUNT):
         cv2.imwrite(str(tmp_path / f"{k:04d}.png"), cut_out(k))
-    reader = MaskReader(tmp_path / "%04d.png", SIZE)
-    found = [reader.read(k) for k in range(COUNT)]
+    with MaskReader(tmp_path / "%04d.png", SIZE) as reader:
+        found = [reader.read(k) for k in range(COUNT)]
     assert [k for k in range(COUNT) if found[k] is not None] == list(SPAN)
     assert all(np.array_equal(found[k], mask(k)) for k in SPAN)
 
