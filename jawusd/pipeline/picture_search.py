@@ -34,6 +34,9 @@ _SHORTEST_UP = 0.5
 # Fractions of the contour in sight that must match the colours, with several cameras and with one: minimum for a
 # searched start, and value at which the search ends; and minimum for picks. See docs/explanation/constants.md.
 _LEAST_FIT, _CLEAR_FIT, _LEAST_PICKED_FIT = (0.38, 0.4), (0.5, 0.6), 0.3
+# With several cameras, fraction from which no other start of the same orientation is tried: arches that are shifted by
+# a tooth fit images from the sides up to 0.65.
+_CERTAIN_FIT = 0.7
 
 T = TypeVar("T")
 T_co = TypeVar("T_co", covariant=True)
@@ -91,7 +94,7 @@ class PictureSearch(Generic[T]):
     judged: Callable[[int, T], tuple[T, float]]
 
     def run(self, frames: range, progress: Progress, up_world: Array | None = None) -> Start[T]:
-        """Return the first start that fits clearly, or else the best one among some frames.
+        """Return the first start that certainly fits, or else the best one among some frames.
 
         Without `up_world`, the up direction of the head in the world (3,), four camera orientations are tried and, if
         no start of several cameras fits clearly, starts of single cameras in the frame with the best one. If it is
@@ -105,6 +108,7 @@ class PictureSearch(Generic[T]):
         single = len(self.cameras) == 1
         least = least_fit(len(self.cameras))
         clear = _CLEAR_FIT[single] if single or up_world is None else least
+        certain = clear if single or up_world is not None else _CERTAIN_FIT
         hypotheses = orientations(self.cameras) if up_world is None else [upright_turns(self.cameras, up_world)]
         best: Start[T] | None = None
         nearest: _Candidate | None = None
@@ -121,8 +125,10 @@ class PictureSearch(Generic[T]):
                     progress("try starts", done, len(candidates))
                     if found is not None and (best is None or found.fit > best.fit):
                         best, nearest = found, candidate
-                    if best is not None and best.fit >= clear:
+                    if best is not None and best.fit >= certain:
                         return best
+                if best is not None and best.fit >= clear:
+                    return best
             if len(tried) >= _MOST_TRIED or (best is not None and best.fit >= least):
                 break
         if up_world is None:
