@@ -252,7 +252,7 @@ def _timecodes(clips: Mapping[str, Clip]) -> dict[str, int]:
 
 
 def _timecode_frame(clip: Clip) -> int:
-    """Return the frame number that the time code of a clip's first image states; raise CaptureError if it cannot."""
+    """Return the frame number that the time code of a clip's first image states; raises CaptureError if it cannot."""
     if not clip.timecode:
         hint = 'Set timecode = "HH:MM:SS:FF" of the first frame in this [[camera]], or synchronise by light flashes.'
         raise CaptureError("the clip has no time code.", hint=hint)

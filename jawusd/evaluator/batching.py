@@ -18,7 +18,7 @@ LARGEST = 1e9  # maximum magnitude of values [mm]: far beyond any jaw, but small
 
 
 def as_floats(values: ArrayLike, name: str) -> Array:
-    """Return values as float64; raise ValueError for complex numbers, text, or objects."""
+    """Return values as float64; raises ValueError for complex numbers, text, or objects."""
     found = np.asarray(values)
     if found.dtype.kind not in "biuf":
         raise ValueError(f"{name} must be real numbers, got {found.dtype}")
@@ -26,7 +26,7 @@ def as_floats(values: ArrayLike, name: str) -> Array:
 
 
 def rows_of(values: ArrayLike, tail: tuple[int, ...], name: str) -> tuple[Array, tuple[int, ...]]:
-    """Return values as float64 rows (n, *tail) and the batch shape; raise ValueError if they do not end in ``tail``."""
+    """Return values as float64 rows (n, *tail) and the batch shape; raises ValueError unless they end in ``tail``."""
     values = as_floats(values, name)
     if values.shape == tail:  # fast path for a single row
         return values[None], ()
@@ -67,7 +67,7 @@ def pairs_in_chunks(function: Callable[[Rows], tuple[Array, Array]], rows: Rows)
 
 
 def as_points(points: ArrayLike, name: str) -> Array:
-    """Return one point (3,) or several (P, 3) as float64; raise ValueError for wrong shapes or infinite values."""
+    """Return one point (3,) or several (P, 3) as float64; raises ValueError for wrong shapes or infinite values."""
     points = as_floats(points, name)
     if points.ndim not in (1, 2) or points.shape[-1] != 3 or not points.size:
         raise ValueError(f"{name} must have shape (3,) or (P, 3), got {points.shape}")
@@ -77,7 +77,7 @@ def as_points(points: ArrayLike, name: str) -> Array:
 
 
 def as_keys(frames: ArrayLike, d_keys: ArrayLike) -> tuple[Array, Array]:
-    """Return key times (K,), keys (K, 3); raise ValueError for wrong shapes, infinities, or times not increasing."""
+    """Return key times (K,), keys (K, 3); raises ValueError for wrong shapes, infinities, or times not increasing."""
     frames, keys = as_floats(frames, "frames"), as_floats(d_keys, "d_keys")
     if frames.ndim != 1 or not frames.size or keys.shape != (len(frames), 3):
         raise ValueError(f"frames must have shape (K,) and d_keys (K, 3), K >= 1, got {frames.shape} and {keys.shape}")

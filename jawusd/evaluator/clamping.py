@@ -266,7 +266,7 @@ class Spine:
     @classmethod
     @lru_cache(maxsize=16)
     def of(cls, bound: SliceHull) -> Spine:
-        """Find the spine of a bound; recent results are cached. Raise EvaluatorError if the bound is empty."""
+        """Find the spine of a bound; recent results are cached. Raises EvaluatorError if the bound is empty."""
         d1, centres = bound.section_centres(_SLICES)
         depth = -distances(bound, np.column_stack([d1, centres]))
         deep = depth >= min(_CAP_MM, 0.5 * depth.max(initial=0.0))

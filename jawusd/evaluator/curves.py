@@ -94,7 +94,7 @@ class GlideTable:
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, Array]) -> GlideTable | None:
-        """Build the surface from a rig's arrays, None without one; raise EvaluatorError if not 0 in occlusion."""
+        """Build the surface from a rig's arrays, None without one; raises EvaluatorError if not 0 in occlusion."""
         if "glide_d2" not in arrays:
             return None
         knots, factors = (

@@ -230,7 +230,7 @@ def covariance_of_points(points: Array, sigma_mm: Array) -> Array:
 
 
 def whitening_of(covariance: Array) -> Array:
-    """Return W (n, 6, 6), ``W^T W`` the inverse of covariances, NaN for NaN; raise ValueError for indefinite ones."""
+    """Return W (n, 6, 6), ``W^T W`` the inverse of covariances, NaN for NaN; raises ValueError for indefinite ones."""
     lost = np.asarray(np.isnan(covariance).any(axis=(1, 2)))
     try:
         factor = np.linalg.cholesky(np.where(lost[:, None, None], np.eye(6), covariance))

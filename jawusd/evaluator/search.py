@@ -48,7 +48,7 @@ class BoundedSearch:
         return _Scan(points, *pairs_in_chunks(self._model.decode, points))
 
     def nearest(self, d: Array) -> Array:
-        """Return the nearest points (n, 3) [mm] in the bound, d (n, 3) if inside; raise EvaluatorError without any."""
+        """Return the nearest points (n, 3) [mm] in the bound, d (n, 3) if inside; raises EvaluatorError without any."""
         valid = d.copy()
         out = np.flatnonzero(self._bound.signed_distance(d) > 0)
         if not out.size:

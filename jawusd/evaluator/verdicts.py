@@ -122,7 +122,7 @@ class Limits:
     speed_mm_s: float | None = None  # largest speed of any landmark since the last valid pose; None disables the check
 
     def replaced(self, residual_mm: float | None, tolerance_mm: float | None, speed_mm_s: float | None) -> Limits:
-        """Return the limits, with the given ones replaced; raise ValueError for a tolerance that is negative or NaN."""
+        """Return the limits, with the given ones replaced; raises ValueError for a negative or NaN tolerance."""
         if residual_mm is None and tolerance_mm is None and speed_mm_s is None:
             return self
         if tolerance_mm is not None and not tolerance_mm >= 0:

@@ -42,7 +42,7 @@ from jawusd.geometry.rodrigues import apply_series, cross, dot
 
 
 def packed_model(model: JawModelForm, frames: RigFrames, vectors: Array) -> Array:
-    """Return a packed model, for vectors (4, 4) [mm] of `landmark_vectors`; raise TypeError without a compiled form."""
+    """Return a packed model, for vectors (4, 4) [mm] of `landmark_vectors`; raises TypeError if not compiled."""
     centres, starts = (len(model.centres), None) if isinstance(model, AnchoredModel) else (0, model.starts)
     head: list[ArrayLike] = [
         [KINDS.index(model.kind), centres, 0 if starts is None else len(starts.d), 0],

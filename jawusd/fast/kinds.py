@@ -77,7 +77,7 @@ def joined(parts: Iterable[ArrayLike]) -> Array:
 
 
 def parts_of(model: JawModelForm) -> list[ArrayLike]:
-    """Return the part of a packed model from `REST` on; raise TypeError if its kind has no compiled form."""
+    """Return the part of a packed model from `REST` on; raises TypeError if its kind has no compiled form."""
     if isinstance(model, AnchoredModel):
         return _anchored(model)
     if isinstance(model, AdditiveModel):

@@ -26,12 +26,18 @@ _VIDEO, _PICTURE, _MESH = ("a video", VIDEOS), ("a picture", PICTURES), ("a mesh
 _CALIBRATION = ("a calibration", (".toml", ".json", ".xml", ".csv", ".yml", ".yaml"))
 # Keys in capture.toml, the files that they need, and file types that are not accepted, with their suffixes.
 _KEYS = (
-    (("upper_teeth", "lower_teeth", "mandible", "skull"), "a mesh is needed (.ply, .stl, .obj or .dcm)",
-     (_VIDEO, _PICTURE)),
+    (
+        ("upper_teeth", "lower_teeth", "mandible", "skull"),
+        "a mesh is needed (.ply, .stl, .obj or .dcm)",
+        (_VIDEO, _PICTURE),
+    ),
     (("video", "videos", "upper", "lower"), "a video or an image sequence is needed", (_MESH, _CALIBRATION)),
-    (("calibration",), "a calibration is needed; clips of a board belong in [boards] videos",
-     (_MESH, _VIDEO, _PICTURE)),
-)  # fmt: skip
+    (
+        ("calibration",),
+        "a calibration is needed; clips of a board belong in [boards] videos",
+        (_MESH, _VIDEO, _PICTURE),
+    ),
+)
 
 
 def is_pattern(path: Path) -> bool:

@@ -67,7 +67,7 @@ class PictureSequence(Clip):
         self.has_alpha, self.is_gray, self.is_rgb = False, first.ndim == 2, first.ndim == 3
 
     def _stored(self, index: int) -> tuple[Stored, int]:
-        """Return an image as stored, and the value of white; raise CaptureError if it differs in size."""
+        """Return an image as stored, and the value of white; raises CaptureError if it differs in size."""
         pixels, white = read_stored(self._files[index][1])
         if pixels.shape[1::-1] != self.size_px:
             height, width = pixels.shape[:2]

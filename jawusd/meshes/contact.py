@@ -129,7 +129,7 @@ def _median_edge(corners: Array) -> float:
 
 
 def _wound_solid(name: str, corners: Array, up: float, box: Array, step_mm: float = STEP_MM) -> Solid:
-    """Return the solid of triangles of either winding; raise NoContact, naming the mesh, if it is inconsistent."""
+    """Return the solid of triangles of either winding; raises NoContact, naming the mesh, if it is inconsistent."""
     found = solid(corners, up, box, step_mm)
     if found.entering < 0.5:  # flip a mesh that is inside out
         found = solid(np.ascontiguousarray(corners[:, ::-1]), up, box, step_mm)

@@ -135,7 +135,7 @@ class Winding(NamedTuple):
     """Winding of a mesh's triangles, and whether the mesh is closed."""
 
     closed: bool  # whether every edge is shared by exactly two triangles, in opposite directions
-    consistent: bool  # whether no two triangles share an edge in the same direction, degenerate ones apart
+    consistent: bool  # whether no two triangles share an edge in the same direction, except degenerate ones
     outward: bool  # whether triangles are counter-clockwise seen from outside; a guess if the mesh is not closed
     volume_mm3: float  # enclosed volume; positive if triangles are wound outward
 

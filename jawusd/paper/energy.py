@@ -166,7 +166,7 @@ class RasterCounter:
         self._pool = ThreadPoolExecutor(threads) if threads > 1 else None
 
     def show(self, matrices: Array, masks: Mask) -> None:
-        """Set masks (C, h, w) of a frame and matrices (C, 3, 4), world [mm] to pixels, or raise ValueError."""
+        """Set masks (C, h, w) of a frame and matrices (C, 3, 4), world [mm] to pixels, or raises ValueError."""
         checked_screens(matrices, masks)
         self._matrices = np.asarray(matrices, np.float64)
         self._width = masks.shape[2]

@@ -40,7 +40,7 @@ _MOVES = ("opening d1", "laterotrusion d2", "protrusion d3")
 
 
 def draw_experiments(found: Experiments, folder: Path) -> list[Path]:
-    """Draw all `FIGURES` into a folder, as PNG and SVG, or raise OutputError; return the files."""
+    """Draw all `FIGURES` into a folder, as PNG and SVG, or raises OutputError; return the files."""
     drawn = (
         condyle_figure(found),
         reconstruction_figure(found),

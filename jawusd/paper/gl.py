@@ -137,7 +137,7 @@ class GlCounter:
         self._most_layers = int(context.info["GL_MAX_ARRAY_TEXTURE_LAYERS"])
 
     def show(self, matrices: Array, masks: Mask) -> None:
-        """Set masks of one frame as `RasterCounter.show` does; raise ValueError if too large for the device."""
+        """Set masks of one frame as `RasterCounter.show` does; raises ValueError if too large for the device."""
         checked_screens(matrices, masks)
         views, height, width = masks.shape
         size = (-(-width // _ROUND_PX) * _ROUND_PX, -(-height // _ROUND_PX) * _ROUND_PX)

@@ -140,11 +140,9 @@ def bone_findings(parts: Parts) -> Iterator[Finding]:
         vertices = parts.meshes[bone].vertices
         apart = np.median([np.linalg.norm(vertices - point, axis=1).min() for point in scan.crown_vertices(300)])
         if apart > _TEETH_TO_BONE_MM:
-            message = (
-                f"the {bone} is {apart:.0f} mm from the {arch} teeth; at most {_TEETH_TO_BONE_MM:g} mm is plausible"
-            )
-            path, hint = getattr(parts.given.scans, bone), "Export it in the coordinate frame of the scans, in mm."
-            limit = _TEETH_TO_BONE_MM
+            limit, path = _TEETH_TO_BONE_MM, getattr(parts.given.scans, bone)
+            message = f"the {bone} is {apart:.0f} mm from the {arch} teeth; at most {limit:g} mm is plausible"
+            hint = "Export it in the coordinate frame of the scans, in mm."
             yield Finding("bone_elsewhere", "warning", message, float(apart), limit, path=str(path), hint=hint)
     landmarks = dict(zip(LANDMARKS, subject_of_capture(parts.given, parts.meshes).landmarks, strict=True))
     width = float(np.linalg.norm(landmarks["condyle_left"] - landmarks["condyle_right"]))

@@ -94,7 +94,10 @@ class PictureSearch(Generic[T]):
     judged: Callable[[int, T], tuple[T, float]]
 
     def run(self, frames: range, progress: Progress, up_world: Array | None = None) -> Start[T]:
-        """Return the first start that certainly fits, or else the best one among some frames.
+        """Return the first start that fits certainly, or else the best one among some frames.
+
+        A start of several cameras that fits clearly, but not certainly, is compared with those in the other frames of
+        its orientation.
 
         Without `up_world`, the up direction of the head in the world (3,), four camera orientations are tried and, if
         no start of several cameras fits clearly, starts of single cameras in the frame with the best one. If it is

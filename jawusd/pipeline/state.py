@@ -232,7 +232,7 @@ def locked(folder: Path) -> Iterator[None]:
 
 
 def _lock(handle: int, folder: Path) -> bool:
-    """Lock an open file, or raise OutputError; return False, with a warning, if the file system has no locks."""
+    """Lock an open file, or raises OutputError; return False, with a warning, if the file system has no locks."""
     deadline = time.monotonic() + _ENDING_S
     while True:
         try:

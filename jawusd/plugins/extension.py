@@ -138,9 +138,8 @@ def packed_reader() -> str:
         bodies.append(_body(module, source, tree, imported))
     header = [f"import {name}" for name, names in imported.items() if not names]
     header += [f"from {name} import {', '.join(sorted(names))}" for name, names in imported.items() if names]
-    start = f'"""{ast.get_docstring(tree, clean=False)}"""\n\nfrom __future__ import annotations\n\n' + "\n".join(
-        sorted(header)
-    )
+    docstring = ast.get_docstring(tree, clean=False)
+    start = f'"""{docstring}"""\n\nfrom __future__ import annotations\n\n' + "\n".join(sorted(header))
     return "\n\n\n".join([start, *bodies]) + "\n"
 
 

@@ -109,7 +109,7 @@ def note_unseen(layer: Sdf.Layer, carried: ArrayLike, by_skin: ArrayLike, lost: 
 
 
 def root_prim_of(actor: Path) -> str:
-    """Return the name of the rig's root prim in an actor's file; raise RigError if not exactly one is a rig."""
+    """Return the name of the rig's root prim in an actor's file; raises RigError if not exactly one is a rig."""
     stage = open_stage(actor)
     names = [prim.GetName() for prim in rig_prims(stage) if prim.GetPath().IsRootPrimPath()]
     if len(names) != 1:

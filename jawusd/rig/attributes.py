@@ -51,7 +51,7 @@ def write_arrays(prim: Sdf.PrimSpec, rig: JawRig, prefixes: tuple[str, ...]) -> 
 
 
 def read_arrays(prim: Usd.Prim, kind: str) -> dict[str, Array]:
-    """Return all model arrays of a rig prim by name; raise FormatError for missing, wrong or too short ones."""
+    """Return all model arrays of a rig prim by name; raises FormatError for missing, wrong or too short ones."""
     arrays: dict[str, Array] = {}
     lengths: dict[str, int] = {}
     authored = present_arrays(kind, lambda _, spec: prim.GetAttribute(spec.attribute or "").HasAuthoredValue())
@@ -74,7 +74,7 @@ def read_arrays(prim: Usd.Prim, kind: str) -> dict[str, Array]:
 
 
 def read_value(prim: Usd.Prim, name: str) -> object:
-    """Return the default value of an attribute; raise FormatError if there is none, or too many numbers."""
+    """Return the default value of an attribute; raises FormatError if there is none, or too many numbers."""
     attribute = prim.GetAttribute(name)
     value = value_of(attribute) if attribute else None
     if value is None:
@@ -83,7 +83,7 @@ def read_value(prim: Usd.Prim, name: str) -> object:
 
 
 def value_of(attribute: Usd.Attribute, time: Usd.TimeCode | None = None) -> object:
-    """Return the value of an attribute at a time, by default its default; raise FormatError for over `MAX_VALUES`."""
+    """Return the value of an attribute at a time, by default its default; raises FormatError for over `MAX_VALUES`."""
     value = attribute.Get(Usd.TimeCode.Default() if time is None else time)
     if hasattr(value, "__len__") and len(value) > MAX_VALUES:
         raise FormatError(f"{attribute.GetPath()} has {len(value)} values, more than the limit of {MAX_VALUES}.")

@@ -240,7 +240,7 @@ def read_geometry(path: AnyPath, prim_path: str | None = None, *, placeholders: 
 
 @raises_format_error
 def read_gum(path: AnyPath, prim_path: str | None = None) -> dict[str, Mask]:
-    """Return masks of gum faces (F,) of teeth meshes with a gum subset, by `MESH_PATHS`; raise RigError if not USD."""
+    """Return masks of gum faces (F,) of teeth meshes with a gum subset, by `MESH_PATHS`; raises RigError if not USD."""
     stage = open_stage(path)
     found = {}
     for name, place in _mesh_paths(stage, path, prim_path).items():

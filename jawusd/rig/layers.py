@@ -139,7 +139,7 @@ def _joint(joint: str, name: str, before: str) -> str:
 
 
 def stage_of(layer: Sdf.Layer) -> Usd.Stage:
-    """Return a stage whose root is an anonymous layer, for schema classes; raise RigError if OpenUSD cannot open it."""
+    """Return a stage whose root is an anonymous layer, for schema classes; raises RigError if OpenUSD fails to."""
     stage = Usd.Stage.Open(layer, load=Usd.Stage.LoadNone)
     if stage is None:
         raise RigError("OpenUSD could not open an anonymous layer.")

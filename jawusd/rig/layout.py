@@ -48,7 +48,7 @@ def prim_name_of(actor: str) -> str:
 
 
 def check_prim_name(name: str) -> str:
-    """Return a name for an actor's prim; raise RigError if it is not an identifier in all versions of OpenUSD."""
+    """Return a name for an actor's prim; raises RigError if it is not an identifier in all versions of OpenUSD."""
     if not (name.isascii() and Sdf.Path.IsValidIdentifier(name)):
         hint = "Use letters, digits and _, starting with a letter, as in hero_2. Set the name with --prim-name."
         raise RigError(f'"{name}" is not a valid prim name.', hint=hint)
@@ -56,7 +56,7 @@ def check_prim_name(name: str) -> str:
 
 
 def actor_in_folder(path: Path) -> Path:
-    """Return the actor file in the folder of a rig, and other paths unchanged; raise RigError without one."""
+    """Return the actor file in the folder of a rig, and other paths unchanged; raises RigError without one."""
     build = f"This is a capture. Build a rig from it: jawusd build {path} -o out"
     if path.suffix == ".toml" and path.is_file():
         raise RigError("is not a rig.", path=path, hint=build)

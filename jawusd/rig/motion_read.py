@@ -64,7 +64,10 @@ def poses_at(mandible: Usd.Prim, actor: Usd.Prim, times: ArrayLike) -> Array:
 
 
 def poses_in_actor(prim: Usd.Prim, actor: Usd.Prim, times: Sequence[Usd.TimeCode]) -> Array:
-    """Return transforms (F, 4, 4) from the meshes below a prim to its actor; raise FormatError if deformed or apart."""
+    """Return transforms (F, 4, 4) from the meshes below a prim to its actor.
+
+    Raises FormatError if bones deform the meshes, or if these move differently.
+    """
     bones = bones_of(prim)
     if bones is not None:
         return bones.poses(actor, times)
@@ -123,7 +126,7 @@ def read_parameters_of_stage(path: AnyPath, prim_path: str | None = None) -> tup
 
 
 def parameters_of(actor: Usd.Prim) -> tuple[Array, Array, float] | None:
-    """Read d of a rig prim as `read_parameters_of_stage` does; raise FormatError for too many or infinite samples."""
+    """Read d of a rig prim as `read_parameters_of_stage` does; raises FormatError for too many or infinite samples."""
     stage = actor.GetStage()
     attributes = [actor.GetAttribute(name) for name in PARAMETERS]
     sampled = [key_times(attribute) for attribute in attributes if attribute]
@@ -143,12 +146,12 @@ def parameters_of(actor: Usd.Prim) -> tuple[Array, Array, float] | None:
 
 
 def mandible_of(actor: Usd.Prim) -> Usd.Prim:
-    """Return the mandible prim of a rig; raise FormatError if jaw:mandible has no single target that can be moved."""
+    """Return the mandible prim of a rig; raises FormatError if jaw:mandible has no single target that can be moved."""
     return _relationship_target(actor, "jaw:mandible")
 
 
 def skull_of(actor: Usd.Prim) -> Usd.Prim | None:
-    """Return the skull prim of a rig, None if unset or inactive; raise FormatError if missing or not the only one."""
+    """Return the skull prim of a rig, None if unset or inactive; raises FormatError if missing or not the only one."""
     relationship = actor.GetRelationship("jaw:skull")
     targets = relationship.GetTargets() if relationship else []
     found = [actor.GetStage().GetPrimAtPath(target) for target in targets]
@@ -178,7 +181,7 @@ def _relationship_target(actor: Usd.Prim, name: str) -> Usd.Prim:
 
 
 def frames_of_stage(stage: Usd.Stage) -> NDArray[np.int64]:
-    """Return the whole frames between start and end of a stage; raise FormatError if there are none, or too many."""
+    """Return the whole frames between start and end of a stage; raises FormatError if there are none, or too many."""
     if not stage.HasAuthoredTimeCodeRange():
         raise FormatError(
             "has no start and end time codes, which determine the frames to read.",
@@ -225,7 +228,7 @@ def compared_with_parameters(actor: Usd.Prim, mandible: Usd.Prim, rig: JawRig) -
 
 
 def skull_displacement_mm(actor: Usd.Prim, rig: JawRig) -> float:
-    """Return the largest displacement [mm] of the skull in its actor; raise FormatError if bones deform it."""
+    """Return the largest displacement [mm] of the skull in its actor; raises FormatError if bones deform it."""
     skull = skull_of(actor)
     if skull is None:
         return 0.0

@@ -46,7 +46,7 @@ Run = Callable[[Sequence[str], Mapping[str, Floats]], list[Array]]
 
 
 def write_onnx(path: AnyPath, model: onnx.ModelProto) -> Path:
-    """Write a graph atomically; raise OutputError if that fails."""
+    """Write a graph atomically; raises OutputError if that fails."""
     write_bytes_atomic(path, model.SerializeToString(deterministic=True))
     return Path(path)
 
@@ -136,7 +136,7 @@ def _whole_rig(rig: JawRig) -> dict[str, str]:
 
 
 def rig_in(model: onnx.ModelProto, path: AnyPath) -> JawRig | None:
-    """Return the rig in the metadata of a graph, None in older files; raise FormatError if it is damaged."""
+    """Return the rig in the metadata of a graph, None in older files; raises FormatError if it is damaged."""
     properties = _properties(model)
     if "arrays" not in properties:
         return None
@@ -217,7 +217,7 @@ def _error_mm(model: onnx.ModelProto, rig: JawRig, d: Array) -> float:
 
 
 def load_sidecar(path: AnyPath, rig: JawRig, recorded: str | None = None) -> onnx.ModelProto:
-    """Read a graph that was made from the model of a rig; raise FormatError as `onnx_error_mm` does."""
+    """Read a graph that was made from the model of a rig; raises FormatError as `onnx_error_mm` does."""
     model = read_sidecar(path, recorded)
     check_made_from(model, rig, path)
     return model
@@ -230,7 +230,7 @@ def check_made_from(model: onnx.ModelProto, rig: JawRig, path: AnyPath) -> None:
 
 
 def read_sidecar(path: AnyPath, recorded: str | None = None) -> onnx.ModelProto:
-    """Read a graph; raise FormatError if it is not the recorded file, or not an ONNX file of jawusd."""
+    """Read a graph; raises FormatError if it is not the recorded file, or not an ONNX file of jawusd."""
     check_input(path)
     try:
         content = Path(path).read_bytes()

@@ -65,7 +65,7 @@ def open_stage(path: AnyPath) -> Usd.Stage:
 
 
 def find_rig_prim(stage: Usd.Stage, path: AnyPath, prim_path: str | None = None) -> Usd.Prim:
-    """Return the prim of a rig; raise FormatError if there is none, there are several, or the given one is no rig."""
+    """Return the prim of a rig; raises FormatError if there is none, there are several, or the given one is no rig."""
     if prim_path is not None:
         prim = stage.GetPrimAtPath(prim_path) if Sdf.Path.IsValidPathString(prim_path) else None
         if not prim or not has_jaw_api(prim):
@@ -138,7 +138,7 @@ def check_units(prim: Usd.Prim) -> None:
 
 @raises_format_error
 def read_table(prim: Usd.Prim) -> DecoderTable:
-    """Read the sampled decoder of a rig prim; raise FormatError if values are inconsistent, VersionError if too new."""
+    """Read the sampled decoder of a rig prim; raises FormatError for inconsistent values, VersionError if too new."""
     upgrade_rig(prim)
     stored_as = str(read_value(prim, "jaw:decoder:format"))
     d1, d2, d3 = (_numbers(prim, f"jaw:decoder:d{i}Knots") for i in (1, 2, 3))

@@ -116,10 +116,8 @@ def check_bounds(prim: Usd.Prim) -> Iterator[_Fault]:
     if outside.any():
         values = ", ".join(f"{x:.2f}" for x in d[worst])
         verdict = place(float(margin[worst]), rig.tolerance_mm)
-        message = (
-            f"{outside.sum()} of {len(d)} samples are outside; worst at {time_codes(times)[worst]}: d = ({values}) mm, "
-        )
-        message += f"margin {margin[worst]:.2f} mm, {verdict}."
+        message = f"{outside.sum()} of {len(d)} samples are outside; worst at {time_codes(times)[worst]}: "
+        message += f"d = ({values}) mm, margin {margin[worst]:.2f} mm, {verdict}."
         yield "warning" if verdict == OUTSIDE else "info", prim, message
 
 

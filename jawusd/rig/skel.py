@@ -168,7 +168,10 @@ class Bones:
         ]
 
     def poses(self, actor: Usd.Prim, times: Iterable[Usd.TimeCode]) -> Array:
-        """Return transforms (n, 4, 4) [mm] from meshes to actor at n times; raise FormatError if deformed or apart."""
+        """Return transforms (n, 4, 4) [mm] from the meshes to the actor at n times.
+
+        Raises FormatError if a mesh is deformed, not bound, or moves differently from the others.
+        """
         for mesh in layout.meshes_below(self._prim):
             if mesh.GetPath() not in {skinning.GetPrim().GetPath() for skinning, _ in self._bound}:
                 raise FormatError(

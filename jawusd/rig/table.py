@@ -35,7 +35,7 @@ _POINTS = 40  # number of mandible points at which the curvature is measured
 
 
 def valid_box(rig: JawRig) -> Array:
-    """Return the box (3, 2) [mm] of the table: `d_range`, widened to all valid d; raise RigError if none is valid."""
+    """Return the box (3, 2) [mm] of the table: `d_range`, widened to all valid d; raises RigError if none is valid."""
     box = np.array(rig.d_range, dtype=np.float64)
     reach = 1.0 + rig.bound.offset_mm + rig.bound.softness_mm
     wide = box + np.array([-reach, reach])

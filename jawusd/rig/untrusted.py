@@ -88,7 +88,7 @@ def value_error_message(error: BaseException) -> str:
 
 
 def open_checked(path: Path) -> Usd.Stage:
-    """Open a stage; raise RigError if it is not USD, or refers to files that `check_file_access` rejects."""
+    """Open a stage; raises RigError if it is not USD, or refers to files that `check_file_access` rejects."""
     note_input(path)
     try:
         with most_cpu(MAX_CPU_S):
@@ -199,7 +199,7 @@ def _referenced_layers(layer: Sdf.Layer, rig_folder: Path | None, variables: Map
 
 
 def _checked_file(layer: Sdf.Layer, asset: str, folder: Path) -> Path:
-    """Return the file of an asset path; raise RigError if it is outside the folder, links resolved, and not allowed."""
+    """Return an asset path's file; raises RigError if it is outside the folder, links resolved, and not allowed."""
     target = target_of(layer, asset)
     if target is None or not (is_allowed(file_of(target)) or file_of(target).resolve().is_relative_to(folder)):
         found = f"refers to the file {asset:.200}, outside the folder of this file."

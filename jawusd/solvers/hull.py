@@ -38,7 +38,7 @@ class Expansion(NamedTuple):
 
 
 class Hull(Formula):
-    """The slice hull of a rig, see `jawusd.evaluator.bounds`; raise EvaluatorError if it is empty."""
+    """The slice hull of a rig, see `jawusd.evaluator.bounds`; raises EvaluatorError if it is empty."""
 
     directions: Tensor
     scan: Tensor

@@ -221,11 +221,16 @@ def _explore(rng: np.random.Generator) -> tuple[Array, Array, Array]:
     return 0.5 + 0.5 * np.tanh(1.1 * noise[:, 0] - 0.25), np.tanh(noise[:, 1]), np.tanh(noise[:, 2])
 
 
-# Each exercise is named after its function.
 _EXERCISES = {
-    curves.__name__[1:].replace("_", " "): curves
-    for curves in (
-        _open, _lateral, _lateral_half_open, _protrude, _protrude_half_open, _sagittal_border, _frontal_border,
-        _circumduct, _chew, _speech, _explore,
-    )
-}  # fmt: skip
+    "open": _open,
+    "lateral": _lateral,
+    "lateral half open": _lateral_half_open,
+    "protrude": _protrude,
+    "protrude half open": _protrude_half_open,
+    "sagittal border": _sagittal_border,
+    "frontal border": _frontal_border,
+    "circumduct": _circumduct,
+    "chew": _chew,
+    "speech": _speech,
+    "explore": _explore,
+}

@@ -35,9 +35,8 @@ class FootagePanel:
         self._client, self._capture, self._turned, self._changed = client, capture, turned, changed
         self._loading = False
         self.view = next(iter(capture.sizes_px))
-        self.frame = (
-            capture.source.bootstrap.frame if capture.tracks is None and capture.source.bootstrap else capture.frames[0]
-        )
+        picks = capture.source.bootstrap
+        self.frame = picks.frame if capture.tracks is None and picks else capture.frames[0]
         self.frame = min(max(self.frame, capture.frames[0]), capture.frames[1])
         self.worst = [] if capture.tracks is None else frames_to_inspect(capture.tracks, capture.source.fps)
         gui = client.gui

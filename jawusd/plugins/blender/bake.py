@@ -41,7 +41,7 @@ def parameters_over(actor: bpy.types.Object, scene: bpy.types.Scene, frames: ran
 
 
 def frames_of(actor: bpy.types.Object, scene: bpy.types.Scene, span: str) -> range:
-    """Return the frames of the scene, or of an actor's take, first to last slider key; raise JawusdError if none."""
+    """Return the frames of the scene, or of an actor's take, first to last slider key; raises JawusdError if none."""
     if span == "SCENE":
         return range(scene.frame_start, scene.frame_end + 1)
     times = [point.co[0] for curve in jaw.curves(actor) for point in curve.keyframe_points]

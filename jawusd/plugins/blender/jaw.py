@@ -106,7 +106,7 @@ def meshes_of(mandible: bpy.types.Object) -> list[bpy.types.Object]:
 
 
 def rig_of(actor: bpy.types.Object) -> vendored.JawRig:
-    """Return the evaluator of an actor, cached by its stored text; raise JawusdError if an older add-on stored it."""
+    """Return the evaluator of an actor, cached by its stored text; raises JawusdError if an older add-on stored it."""
     text = actor[_STORE]
     if text not in _rigs:
         if text.startswith("{"):

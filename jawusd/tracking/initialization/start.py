@@ -144,10 +144,9 @@ def _check_upright(search: StartSearch, footage: Footage, frame: int, found: Sea
     except TrackingError:
         return
     if other.objective_px > found.objective_px:
-        evidence = f"{other.objective_px:.0f} px of contour match after exchanging them"
-        raise replace(exchange, message=f"{exchange.message}: {evidence}, {found.objective_px:.0f} px as given").error(
-            frame
-        )
+        evidence = f"{other.objective_px:.0f} px of contour match after exchanging them, "
+        evidence += f"{found.objective_px:.0f} px as given"
+        raise replace(exchange, message=f"{exchange.message}: {evidence}").error(frame)
 
 
 _PICKS_OFF_MM = 3.0  # minimum distance between picked and found poses for a warning [mm]: half a tooth

@@ -187,7 +187,7 @@ class StartSearch:
         return SearchResult(ends[best].poses, float(objective[best]), fits)
 
     def _refined_pairs(
-        self, finalists: Sequence[Sequence[Array]], together: Sequence[Array], views: Sequence[View]
+        self, finalists: Sequence[Sequence[Array]], pairs: Sequence[Array], views: Sequence[View]
     ) -> list[Array]:
         """Refine the finalists and pairs coarsely; return up to four anatomically possible pairs, shape (2, 4, 4)."""
 
@@ -208,11 +208,11 @@ class StartSearch:
         upper, lower = (ends[0][1] for ends in alone)
         alone[0] += ranked(0, [lower @ se3_inverse(jaw) for jaw in self._jaws], lower)
         alone[1] += ranked(1, [upper @ jaw for jaw in self._jaws], upper)
-        pairs = [(u[0] + v[0], np.stack([u[1], v[1]])) for u in alone[0] for v in alone[1]]
-        together = [pair for _, pair in aligned(together, self._config.trial_gates_px)[:_REFINED]]
-        pairs += aligned(together, self._config.wide_gates_px)
-        pairs = [p for p in pairs if self._possible(p[1])]
-        return [poses for _, poses in sorted(pairs, key=lambda p: -p[0])[:4]]
+        found = [(u[0] + v[0], np.stack([u[1], v[1]])) for u in alone[0] for v in alone[1]]
+        best = [poses for _, poses in aligned(pairs, self._config.trial_gates_px)[:_REFINED]]
+        found += aligned(best, self._config.wide_gates_px)
+        possible = [pair for pair in found if self._possible(pair[1])]
+        return [poses for _, poses in sorted(possible, key=lambda pair: -pair[0])[:4]]
 
     def _possible(self, poses: Array) -> bool:
         """Return whether the poses of the arches are anatomically possible."""

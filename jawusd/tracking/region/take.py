@@ -57,10 +57,9 @@ def camera_findings(names: Sequence[str], solutions: Iterable[Solution]) -> list
     out, best = [], float(share.max())
     for c, name in enumerate(names):
         if share[c] < _LEAST_SHARE * best:
-            message = (
-                f"{share[c]:.0%} of the teeth's outlines match this camera's images, compared with {best:.0%} for "
-            )
-            message += f"the best camera; at least {_LEAST_SHARE:.0%} of that is usual. This camera contributes little."
+            message = f"{share[c]:.0%} of the teeth's outlines match this camera's images, compared with {best:.0%} "
+            message += f"for the best camera; at least {_LEAST_SHARE:.0%} of that is usual. "
+            message += "This camera contributes little."
             hint = "Check its video, its calibration (the camera may have moved) and its time offset."
             value, limit = round(float(share[c]), 3), round(_LEAST_SHARE * best, 3)
             out.append(Finding("camera_rarely_used", "warning", message, value, limit, camera=name, hint=hint))

@@ -151,10 +151,8 @@ def misfit_findings(records: Mapping[int, FrameRecord]) -> list[Finding]:
     whole = [records[frame].solution for frame in whole_frames(records)]
     if len(whole) < _TELLING_FRAMES:
         return []
-    share, rough = (
-        np.median([fitting_share(s) for s in whole], axis=0),
-        np.nanmedian([residual_px(s) for s in whole], axis=0),
-    )
+    share = np.median([fitting_share(s) for s in whole], axis=0)
+    rough = np.nanmedian([residual_px(s) for s in whole], axis=0)
     out = []
     for r, other in ((0, 1), (1, 0)):
         if share[r] < _FITS_LESS * share[other] and rough[r] > _FITS_ROUGHER * rough[other]:
